@@ -1,0 +1,1 @@
+"""The live pages of NMSS Lab: choices and views, no mathematics."""
