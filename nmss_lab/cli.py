@@ -1,0 +1,146 @@
+"""The command ``nmss-lab``: serve the live pages, reproduce the thesis, simulate.
+
+Numerical and page libraries are imported inside the commands that need them, so
+that ``--version`` and ``--help`` answer at once.
+"""
+
+import argparse
+import importlib
+import json
+import os
+import signal
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from nmss_lab import __version__
+
+__all__ = ["main"]
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line and return its exit code.
+
+    Parameters
+    ----------
+    argv : sequence of str, optional
+        Arguments after the command's name; those of the process by default.
+
+    Returns
+    -------
+    int
+        0 after success, 1 after an error that is the caller's to mend.  Arguments
+        that cannot be read leave through ``SystemExit(2)``, as argparse does.
+    """
+    arguments = _parser().parse_args(argv)
+    command: Callable[[argparse.Namespace], None] = arguments.command
+    try:
+        command(arguments)
+    except (ValueError, OSError) as error:
+        print(f"nmss-lab: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="nmss-lab",
+        description="Predictive control structures in the non-minimal state space.",
+    )
+    parser.add_argument(
+        "--version", action="version", version=f"%(prog)s {__version__}"
+    )
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    _add_serve(commands)
+    _add_reproduce(commands)
+    _add_simulate(commands)
+    return parser
+
+
+def _add_serve(commands: Any) -> None:
+    serve = commands.add_parser("serve", help="serve the live pages")
+    serve.add_argument("--port", type=int, default=5006, help="0 takes any free port")
+    serve.add_argument("--address", default="127.0.0.1", help="address to listen on")
+    serve.add_argument("--show", action="store_true", help="open the web browser")
+    serve.set_defaults(command=_serve)
+
+
+def _add_reproduce(commands: Any) -> None:
+    reproduce = commands.add_parser(
+        "reproduce", help="compare the thesis's numbers with computed ones"
+    )
+    reproduce.add_argument("chapter", nargs="?", type=int, help="all by default")
+    reproduce.add_argument("--json", action="store_true", help="print JSON")
+    reproduce.set_defaults(command=_reproduce)
+
+
+def _add_simulate(commands: Any) -> None:
+    simulate = commands.add_parser("simulate", help="run a case in closed loop")
+    simulate.add_argument("case", nargs="?", help="its name; without it: list them")
+    simulate.add_argument("--structure", help="name of a structure")
+    simulate.add_argument("--csv", metavar="FILE", help="write the run to FILE")
+    simulate.set_defaults(command=_simulate)
+
+
+def _reproduce(arguments: argparse.Namespace) -> None:
+    reproduce = importlib.import_module("nmss_lab.reproduce")
+    claims = reproduce.claims(arguments.chapter)
+    if arguments.json:
+        print(json.dumps([claim.as_dict() for claim in claims], indent=2))
+    else:
+        print(reproduce.table(claims))
+
+
+def _simulate(arguments: argparse.Namespace) -> None:
+    raise ValueError("simulate is not available in this version")
+
+
+def _serve(arguments: argparse.Namespace) -> None:
+    """Serve the pages until interrupted (Ctrl-C) or terminated."""
+    # Every script, style sheet and font comes from the installed packages.
+    os.environ["BOKEH_RESOURCES"] = "server"
+    from panel.io.server import get_server
+
+    server = get_server(
+        _pages(),
+        port=arguments.port,
+        address=arguments.address,
+        websocket_origin=_origins(arguments.address),
+        show=arguments.show,
+        title="NMSS Lab",
+    )
+    # get_server has already taken care of Ctrl-C in the same way.
+    signal.signal(
+        signal.SIGTERM,
+        lambda *_: server.io_loop.add_callback_from_signal(server.io_loop.stop),
+    )
+    server.start()
+    address = f"http://{arguments.address}:{server.port}/"
+    print(f"NMSS Lab is at {address} (Ctrl-C stops it)", flush=True)
+    server.io_loop.start()
+    server.stop()
+    print("NMSS Lab has stopped", flush=True)
+
+
+def _origins(address: str) -> str | None:
+    """Return the hosts whose pages may connect; None: the address listened on."""
+    return "*" if address in {"0.0.0.0", "::", ""} else None
+
+
+def _pages() -> Mapping[str, Callable[[], Any]]:
+    """Return the pages of ``apps.dashboard``: URL path to a builder per session.
+
+    A wheel carries the package ``apps`` in ``nmss_lab/_pages``; in a checkout it
+    lies beside ``nmss_lab``.
+    """
+    here = Path(__file__).resolve().parent
+    shipped = here / "_pages"
+    sys.path.insert(0, str(shipped if shipped.is_dir() else here.parent))
+    pages: Mapping[str, Callable[[], Any]]
+    pages = importlib.import_module("apps.dashboard").pages()
+    return pages
+
+
+if __name__ == "__main__":
+    sys.exit(main())
