@@ -102,14 +102,19 @@ def _serve(arguments: argparse.Namespace) -> None:
     os.environ["BOKEH_RESOURCES"] = "server"
     from panel.io.server import get_server
 
-    server = get_server(
-        _pages(),
-        port=arguments.port,
-        address=arguments.address,
-        websocket_origin=_origins(arguments.address),
-        show=arguments.show,
-        title="NMSS Lab",
-    )
+    pages = _pages()
+    try:
+        server = get_server(
+            pages,
+            port=arguments.port,
+            address=arguments.address,
+            websocket_origin=_origins(arguments.address),
+            show=arguments.show,
+            title="NMSS Lab",
+        )
+    except OSError as error:
+        where = f"port {arguments.port} of {arguments.address}"
+        raise OSError(f"cannot listen on {where}: {error.strerror}") from error
     # get_server has already taken care of Ctrl-C in the same way.
     signal.signal(
         signal.SIGTERM,
