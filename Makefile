@@ -18,9 +18,9 @@ export OMP_NUM_THREADS ?= 1
 serve: $(READY)
 	@$(BIN)/nmss-lab serve --port $(PORT)
 
-# Notebooks and browser tests keep to one worker per file (tests/conftest.py).
+# One worker per file: cells of a notebook share a kernel, browser tests a server.
 test: lint
-	$(BIN)/pytest -n $(WORKERS) --dist loadgroup --nbval-lax \
+	$(BIN)/pytest -n $(WORKERS) --dist loadfile --nbval-lax \
 	    tests nmss_lab $(wildcard notebooks)
 
 lint: $(READY)

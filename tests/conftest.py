@@ -61,20 +61,6 @@ def rng() -> np.random.Generator:
     return np.random.default_rng(20070930)
 
 
-# --- Order under xdist: files whose tests share a kernel or a server stay whole. --
-
-
-@pytest.hookimpl(tryfirst=True)
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Keep each notebook and each file of server tests on one worker."""
-    for item in items:
-        shares_server = {"server", "page"} & set(getattr(item, "fixturenames", ()))
-        if item.path.suffix == ".ipynb" or shares_server:
-            item.add_marker(pytest.mark.xdist_group(item.path.name))
-        if "page" in getattr(item, "fixturenames", ()):
-            item.add_marker(pytest.mark.browser)
-
-
 # --- The browser ------------------------------------------------------------------
 
 REQUIRED = os.environ.get("NMSS_REQUIRE_BROWSER", "") == "1"
@@ -101,6 +87,13 @@ def find_chromium() -> str | None:
 def _playwright_own() -> str | None:
     with sync_playwright() as playwright:
         return shutil.which(playwright.chromium.executable_path)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark what drives a browser, for ``-m browser`` and ``-m "not browser"``."""
+    for item in items:
+        if {"browser", "page"} & set(getattr(item, "fixturenames", ())):
+            item.add_marker(pytest.mark.browser)
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:

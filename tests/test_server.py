@@ -45,16 +45,17 @@ class Resources(HTMLParser):
             self.found.append(urljoin(self.base, address))
 
 
-def get(url: str) -> str:
-    """Return the text at an address."""
+def get(url: str) -> bytes:
+    """Return what is at an address; a missing page raises HTTPError."""
     with urllib.request.urlopen(url, timeout=60) as answer:
-        return answer.read().decode()
+        content: bytes = answer.read()
+        return content
 
 
 def resources(url: str) -> list[str]:
     """Return the addresses loaded by the page at an address."""
     parser = Resources(url)
-    parser.feed(get(url))
+    parser.feed(get(url).decode())
     return parser.found
 
 
@@ -89,7 +90,7 @@ def test_page_names_only_local_resources(server: Server, path: str) -> None:
 
 @pytest.mark.parametrize("path", PATHS)
 def test_resources_of_page_exist(server: Server, path: str) -> None:
-    """Each script and style sheet a page names is really there."""
+    """Each script, style sheet and picture a page names is really there."""
     for url in resources(server.url + path):
         assert get(url), url
 
