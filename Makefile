@@ -20,7 +20,7 @@ serve: $(READY)
 
 # One worker per file: cells of a notebook share a kernel, browser tests a server.
 test: lint
-	$(BIN)/pytest -n $(WORKERS) --dist loadfile --nbval-lax \
+	$(BIN)/pytest -n $(WORKERS) --dist loadfile --nbval-lax --nbval-current-env \
 	    tests nmss_lab $(wildcard notebooks)
 
 lint: $(READY)
