@@ -15,7 +15,8 @@ from playwright.sync_api import Browser, Page, sync_playwright
 ROOT = Path(__file__).resolve().parent.parent
 
 # --- Tolerances: tests take one of these, or give the reason for another. ---------
-# Use: `from conftest import ALGEBRA`.
+# Use: `from conftest import ALGEBRA`.  Curves read off a figure and statistics have
+# no common value: their tests derive one from the figure or from the sample size.
 
 ALGEBRA = 1e-12
 """Relative to the largest entry: two ways of writing one matrix.
