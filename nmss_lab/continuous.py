@@ -36,7 +36,7 @@ WHOLE = 1e-9
 REDUCTIONS = (1e-8, 1e-10, 1e-12)
 # A reduction passes if it changes no impulse response by more than this share of it.
 UNCHANGED = 1e-13
-# Coefficients below this share of the largest one are rounding.
+# Sums this small against their terms are rounding, and coefficients are set to zero.
 NEGLIGIBLE = 1e-15
 
 NO_FEEDTHROUGH = (
@@ -289,6 +289,8 @@ class ContinuousPlant:
 
         Notes
         -----
+        Modes that fade below rounding within one sample do not count for na.
+
         Sampling much faster than the plant moves puts all poles next to 1, where the
         coefficients of a high-order polynomial say little about its roots: the
         equation then loses digits that the sampled plant still has.
@@ -346,10 +348,11 @@ def difference_model(system: Any, dt: float | None = None) -> DifferenceModel:
         system = ContinuousPlant([[system]])
     if isinstance(system, ContinuousPlant):
         return system.difference_model(_interval(None, dt)[0])
-    interval, continuous = _interval(getattr(system, "dt", None), dt)
+    own = getattr(system, "dt", None)
     if all(hasattr(system, name) for name in "ABCD"):
-        return _from_state_space(system, interval, continuous)
+        return _from_state_space(system, *_interval(own, dt))
     channels = _polynomials(system)
+    interval, continuous = _interval(own, dt)
     if continuous:
         table = [[_channel(*pair) for pair in row] for row in channels]
         return ContinuousPlant(table).difference_model(interval)
@@ -498,9 +501,11 @@ def _equation(blocks: Sequence[_Sampled], n_w: int) -> _Equation:
     b = np.zeros((max((e.lag for *_, e in pairs), default=0) + max(n, 1), n_w))
     for A, c, effect in pairs:
         impulse = _impulse(A, effect.gain[:, None], c, n)[:, 0]
-        numerator = np.convolve(a, impulse)[:n]
+        numerator = _without_rounding(
+            np.convolve(a, impulse)[:n], np.convolve(np.abs(a), np.abs(impulse))
+        )
         b[effect.lag : effect.lag + n, effect.column] += numerator
-    return _Equation(_without_tail(a)[1:], b)
+    return _Equation(_without_rounding(a, a)[1:], b)
 
 
 def _denominator(blocks: Sequence[_Sampled]) -> Array:
@@ -567,11 +572,16 @@ def _annihilates(a: Array, impulse: Array) -> bool:
     return True
 
 
-def _without_tail(polynomial: Array) -> Array:
-    """Drop trailing coefficients (or rows of them) that are only rounding."""
-    size = np.abs(polynomial).reshape(len(polynomial), -1)
-    large = np.any(size > NEGLIGIBLE * size.max(axis=0, initial=0.0), axis=1)
-    return polynomial[: int(np.max(np.flatnonzero(large), initial=-1)) + 1]
+def _without_rounding(values: Array, terms: Array) -> Array:
+    """Set to zero what is only rounding of sums of terms of this size."""
+    smallest = NEGLIGIBLE * np.abs(terms).max(initial=0.0)
+    return np.where(np.abs(values) > smallest, values, 0.0)
+
+
+def _order(coefficients: Array) -> int:
+    """Count coefficients (or matrices) up to the last that is not zero."""
+    used = np.flatnonzero([coefficient.any() for coefficient in coefficients])
+    return int(np.max(used, initial=-1)) + 1
 
 
 def _assemble(
@@ -579,18 +589,14 @@ def _assemble(
 ) -> DifferenceModel:
     """One model from the equations of the outputs; columns after n_u belong to v."""
     n_y = len(rows)
-    a = np.zeros((max(1, *(len(row.a) for row in rows)), n_y, n_y))
+    a = np.zeros((max(1, *(_order(row.a) for row in rows)), n_y, n_y))
     b = np.zeros((max(len(row.b) for row in rows), n_y, rows[0].b.shape[1]))
     for i, row in enumerate(rows):
-        a[: len(row.a), i, i] = row.a
+        a[: _order(row.a), i, i] = row.a[: _order(row.a)]
         b[: len(row.b), i] = row.b
     u, v = b[:, :, :n_u], b[:, :, n_u:]
-    g = _at_least_one(v) if v.shape[2] else None
-    return DifferenceModel(a, _at_least_one(u), g, dt=dt, **names)
-
-
-def _at_least_one(b: Array) -> Array:
-    return _without_tail(b) if b.any() else b[:1]
+    g = v[: max(1, _order(v))] if v.shape[2] else None
+    return DifferenceModel(a, u[: max(1, _order(u))], g, dt=dt, **names)
 
 
 # Systems of other packages
@@ -633,7 +639,7 @@ def _polynomials(system: Any) -> list[list[tuple[Array, Array]]]:
     """Numerator and denominator of every channel, outputs by rows."""
     if hasattr(system, "num") and hasattr(system, "den"):
         num, den = system.num, system.den
-        if np.ndim(den[0]) == 0:  # SciPy: one denominator, a numerator an output
+        if np.isscalar(den[0]):  # SciPy: one denominator, a numerator an output
             return [[(row, np.asarray(den))] for row in np.atleast_2d(num)]
         return [list(zip(*row, strict=True)) for row in zip(num, den, strict=True)]
     if all(hasattr(system, name) for name in ("zeros", "poles", "gain")):
@@ -674,7 +680,7 @@ def _kept(channels: Sequence[Channel]) -> _Equation:
         if channel is not None:
             num = np.divide(channel.num, channel.den[0])
             b[len(b) - len(num) :, column] = num
-    return _Equation(_without_tail(den)[1:], b)
+    return _Equation(den[1:], b)
 
 
 # Checks
