@@ -6,6 +6,7 @@ Everything here is in discrete time; ``continuous`` samples continuous plants ex
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
@@ -203,7 +204,8 @@ class DifferenceModel:
         a = coefficients("a", self.a)
         b = coefficients("b", self.b)
         n_y = a.shape[1]
-        g = np.zeros((0, n_y, 0)) if self.g is None else coefficients("g", self.g)
+        none = self.g is None or np.size(self.g) == 0
+        g = np.zeros((0, n_y, 0)) if none else coefficients("g", self.g)
         if a.shape[2] != n_y:
             raise ValueError(f"a has shape {a.shape}, expected (na, n_y, n_y)")
         for name, value in (("b", b), ("g", g)):
@@ -334,6 +336,15 @@ class DifferenceModel:
             y[k] = plant.output(state)
             state = plant.step(state, u[k], v[k])
         return y
+
+    def varied(
+        self, numerator: float = 1.0, denominator: float = 1.0
+    ) -> DifferenceModel:
+        """Model with b (and g) and a multiplied by factors, as in (6.11)."""
+        g = self.g if self.ng == 0 else self._g * numerator
+        return dataclasses.replace(
+            self, a=self.a * denominator, b=self.b * numerator, g=g
+        )
 
     def plant(self) -> LinearPlant:
         """Plant that obeys this equation, in observer canonical form."""

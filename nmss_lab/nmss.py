@@ -112,7 +112,8 @@ class Form:
     .. math:: x_{k+1} = A x_k + B \nu_k + D r_{k+1} + G \delta_k, \qquad y_k = C x_k
 
     where :math:`\nu` is the input (``drive = "u"``) or its change (``"du"``) and
-    :math:`\delta` holds changes of measured disturbances.
+    :math:`\delta_k = [\Delta v_{k-l_1}; \Delta v_{k-l_2}; \dots]` holds changes of
+    measured disturbances at the given lags.
 
     Parameters
     ----------
@@ -121,6 +122,9 @@ class Form:
     recipe : Recipe
     names : tuple of str
         What each state is, for instance ``"y1[k-1]"``.
+    lags : tuple of int
+        Lags of the changes in delta: 0, 1, ... when they are offsets of the
+        prediction, -1 (the coming change) when past ones are in the state.
     """
 
     A: Array
@@ -131,6 +135,7 @@ class Form:
     drive: Literal["u", "du"]
     recipe: Recipe
     names: tuple[str, ...]
+    lags: tuple[int, ...] = ()
 
     @property
     def n_x(self) -> int:
@@ -174,7 +179,7 @@ def integral_of_error_form(model: DifferenceModel, governed: bool = False) -> Fo
     A = np.block([[plain["A"], np.zeros((n, p))], [-plain["A"][:p], np.eye(p)]])
     B = np.vstack([plain["B"], -plain["B"][:p]])
     D = np.eye(n + p, p, k=-n)
-    layout = _layout(model, integral=p)
+    layout = _layout(model, integral=p, **({"w": p} if governed else {}))
     rows = [_rows(layout, "y", model.na), _rows(layout, "u", model.nb - 1)]
     state = np.vstack([*rows, layout.select("integral")])
     names = (*names, *(f"sum of error in {y}" for y in model.y_names))
@@ -205,12 +210,14 @@ def differenced_form(
     plain, names = _past(model)
     A, B, p = plain["A"], plain["B"], model.n_y
     names = tuple(f"change of {name}" for name in names)
+    lags: tuple[int, ...] = ()
     G = np.zeros((A.shape[0], 0))
     if disturbances == "direct":
-        G = np.zeros((A.shape[0], model.ng * model.n_v))
+        G, lags = np.zeros((A.shape[0], model.ng * model.n_v)), tuple(range(model.ng))
         G[:p] = _side_by_side(model._g)
     if disturbances == "augmented":
         A, B, G, names = _augment(model, A, B, names)
+        lags = (-1,)
     n = A.shape[0]
     A = np.block([[A, np.zeros((n, p))], [A[:p], np.eye(p)]])
     B, G = np.vstack([B, B[:p]]), np.vstack([G, G[:p]])
@@ -222,7 +229,7 @@ def differenced_form(
     state = np.vstack([*rows, _rows(layout, "y", 1)])
     recipe = _recipe(model, layout, state)
     C, D = np.eye(p, n + p, k=n), np.zeros((n + p, p))
-    return Form(A, B, C, D, G, "du", recipe, (*names, *model.y_names))
+    return Form(A, B, C, D, G, "du", recipe, (*names, *model.y_names), lags)
 
 
 def incremental_pip_form(model: DifferenceModel, internal_model: bool = False) -> Form:
@@ -392,6 +399,7 @@ def _recipe(
         enter[layout["integral"], :p] = -np.eye(p)
         if governed:
             store[layout["integral"], 2 * q :] = np.eye(p)
+            _push(layout, "w", keep, store, slice(2 * q, None))
         else:
             enter[layout["integral"], p + r :] = np.eye(p)
     if "y_model" in layout:

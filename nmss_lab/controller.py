@@ -1,0 +1,487 @@
+"""What every controller shares: limits, memory, moves, and the promises it keeps.
+
+A controller is a frozen design.  What changes from sample to sample is its ``Memory``,
+handed in and returned, so one design serves many loops at once:
+
+>>> # memory = controller.start()
+>>> # each sample:  memory = controller.measure(memory, y, r)
+>>> #               move = controller.decide(memory)
+>>> #               memory = controller.apply(memory, applied_u, move)
+
+All of ``Memory`` and ``Move`` may carry a leading axis, one row a loop.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Literal
+
+import numpy as np
+
+from nmss_lab.models import Array, DifferenceModel
+from nmss_lab.nmss import Form
+
+Pair = tuple[Any, Any]
+Softening = Literal["hard", "soft", "priority"]
+
+
+@dataclass(frozen=True, eq=False)
+class Limits:
+    """Limits on inputs, their change per sample, and outputs.
+
+    Parameters
+    ----------
+    u, du, y : pair (low, high)
+        Numbers for all channels or arrays with one entry a channel, in the signal's
+        units; infinite where there is no limit.  ``du`` must allow zero.
+    outputs : "hard", "soft" or "priority"
+        What happens to output limits.  Hard ones are dropped for the samples at which
+        they cannot be kept (6.1.2); soft ones may be broken at a quadratic price;
+        with priorities, the least important give way first and by as little as
+        possible.
+    soft_weight : float
+        Price of one squared unit of violation when ``outputs = "soft"``.
+    priority : tuple of int
+        Rank of each output, 1 the most important, when ``outputs = "priority"``.
+
+    Raises
+    ------
+    ValueError
+        If a limit is not a number, low exceeds high, or ``du`` excludes zero.
+    """
+
+    u: Pair = (-np.inf, np.inf)
+    du: Pair = (-np.inf, np.inf)
+    y: Pair = (-np.inf, np.inf)
+    outputs: Softening = "hard"
+    soft_weight: float = 1e4
+    priority: tuple[int, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Check each pair of limits."""
+        for name in ("u", "du", "y"):
+            low, high = (np.asarray(side, dtype=float) for side in getattr(self, name))
+            if np.isnan(low).any() or np.isnan(high).any():
+                raise ValueError(f"limits on {name}: {low} to {high} are not numbers")
+            if (low > high).any():
+                raise ValueError(
+                    f"limits on {name}: the low side {low} exceeds the high side {high}"
+                )
+            if name == "du" and ((low > 0).any() or (high < 0).any()):
+                raise ValueError(
+                    f"limits on du: {low} to {high} exclude zero, so no input could "
+                    "ever come to rest"
+                )
+        if self.outputs not in ("hard", "soft", "priority"):
+            raise ValueError(
+                f'outputs = "{self.outputs}": expected "hard", "soft" or "priority"'
+            )
+        if not self.soft_weight > 0:
+            raise ValueError(f"soft_weight = {self.soft_weight} must be positive")
+
+    def of(self, name: Literal["u", "du", "y"], size: int) -> tuple[Array, Array]:
+        """Lower and upper limits of a signal, each (size,).
+
+        Raises
+        ------
+        ValueError
+            If there are not as many limits as channels.
+        """
+        sides = [np.asarray(side, dtype=float) for side in getattr(self, name)]
+        for side in sides:
+            if side.ndim > 1 or (side.ndim == 1 and side.shape[0] not in (1, size)):
+                raise ValueError(
+                    f"limits on {name} have shape {side.shape}, expected a number or "
+                    f"({size},), one entry a channel"
+                )
+        low, high = (np.broadcast_to(side, (size,)).copy() for side in sides)
+        return low, high
+
+    def ranks(self, n_y: int) -> Array:
+        """Priority of each output, (n_y,); all equal when none is given.
+
+        Raises
+        ------
+        ValueError
+            If there are not as many ranks as outputs.
+        """
+        ranks = np.array(self.priority or (1,) * n_y)
+        if ranks.shape != (n_y,):
+            raise ValueError(
+                f"priority = {self.priority}: expected {n_y} ranks, one an output"
+            )
+        return ranks
+
+
+class Status(enum.IntEnum):
+    """How a move came about; ``sentence`` says it in words.  Higher is worse."""
+
+    FREE = 0
+    LIMITED = 1
+    SOFTENED = 2
+    DROPPED = 3
+    CLIPPED = 4
+    REFUSED = 5
+    SHIFTED = 6
+    HELD = 7
+
+    @property
+    def sentence(self) -> str:
+        """The status in plain words."""
+        return _SENTENCES[self]
+
+
+_SENTENCES = {
+    Status.FREE: "No limit is active: the linear law was applied.",
+    Status.LIMITED: "A limit is active: the quadratic program was solved.",
+    Status.SOFTENED: "Output limits could not all be kept: they were relaxed.",
+    Status.DROPPED: "Output limits could not be kept: they were dropped this sample.",
+    Status.CLIPPED: "The law asked for more than the input can do: it was clipped.",
+    Status.REFUSED: "A measurement was not a number: the last plan was continued.",
+    Status.SHIFTED: "The solver failed: the last plan was continued and clipped.",
+    Status.HELD: "There was no plan to continue: the last input was held.",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Memory:
+    """All that changes in a controller from sample to sample.
+
+    Parameters
+    ----------
+    vector : array (..., n_m)
+        Histories, laid out by the form's recipe.
+    decision, known : arrays (..., n_z), (..., n_theta)
+        The last plan, to fall back on.
+    shift : integer array (...)
+        Samples since that plan was made; -1 when there is none.
+    refused : bool array (...)
+        Whether the latest measurement was not finite.
+    """
+
+    vector: Array
+    decision: Array
+    known: Array
+    shift: Array
+    refused: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Move:
+    """Decision of one sample.
+
+    Parameters
+    ----------
+    u : array (..., n_u)
+        Input to apply; within the limits on u and du, finite.
+    w : array (..., n_y)
+        Reference in force at this sample: the governed one under a governor.
+    governed : array (..., n_y)
+        Reference that enters the sum of the error when the move is applied.
+    decision, known : arrays (..., n_z), (..., n_theta)
+        Optimal decision and what it was made from: signals of the plan are
+        ``controller.signals[name].value(decision, known)``.
+    status : integer array (...)
+        Code of ``Status``.
+    cost : array (...)
+        Optimal cost J of the sample, in the weights' units.
+    active : bool array (..., rows)
+        Rows of the program held by a limit.
+    iterations : integer array (...)
+    shift : integer array (...)
+        Age of the plan in samples: 0 when it was made now.
+    """
+
+    u: Array
+    w: Array
+    governed: Array
+    decision: Array
+    known: Array
+    status: Array
+    cost: Array
+    active: Array
+    iterations: Array
+    shift: Array
+
+    @property
+    def sentence(self) -> str:
+        """Status of a single move in plain words."""
+        return Status(int(self.status)).sentence
+
+
+@dataclass(frozen=True, eq=False)
+class Controller(ABC):
+    """Base of all controllers: keeps the memory, leaves the decision to subclasses.
+
+    Parameters
+    ----------
+    model : DifferenceModel
+        Model the design rests on.
+    form : Form
+        State and how it is remembered.
+    limits : Limits
+    """
+
+    model: DifferenceModel
+    form: Form
+    limits: Limits
+
+    @property
+    def n_z(self) -> int:
+        """Length of the decision that a memory keeps; 0 without a plan."""
+        return 0
+
+    @property
+    def n_theta(self) -> int:
+        """Length of the known vector that a memory keeps."""
+        return 0
+
+    @property
+    def preview(self) -> int:
+        """How many samples of r beyond r_k ``decide`` reads."""
+        return 0
+
+    @property
+    def forecast_steps(self) -> int:
+        """How many samples of v beyond v_k ``decide`` reads."""
+        return 0
+
+    @cached_property
+    def limits_u(self) -> tuple[Array, Array]:
+        """Level limits (n_u,) each."""
+        return self.limits.of("u", self.model.n_u)
+
+    @cached_property
+    def limits_du(self) -> tuple[Array, Array]:
+        """Rate limits (n_u,) each."""
+        return self.limits.of("du", self.model.n_u)
+
+    @abstractmethod
+    def free_law(self) -> tuple[Array, Array]:
+        """First move without limits: gains on the memory (n_u, n_m) and on r.
+
+        The second gain, (n_u, (1 + preview) n_y), acts on r_k, r_{k+1}, ... as far as
+        ``decide`` is handed them.
+        """
+
+    @abstractmethod
+    def _decide(self, memory: Memory, r: Array, v: Array) -> Move:
+        """Decide for memories with a leading axis of loops."""
+
+    def start(
+        self,
+        y0: Array | None = None,
+        u0: Array | None = None,
+        v0: Array | None = None,
+        r0: Array | None = None,
+    ) -> Memory:
+        """Memory for a past in which y, u and v were constant (zero by default).
+
+        With a past that is not zero, the sum of the error is chosen so that the law
+        asks for u0: switching on is bumpless.
+
+        Raises
+        ------
+        ValueError
+            If a size does not fit or a value is not finite.
+        """
+        model, layout = self.model, self.form.recipe.layout
+        y = signal("y0", y0, model.n_y)
+        u = signal("u0", u0, model.n_u)
+        v = signal("v0", v0, model.n_v)
+        r = signal("r0", r0, model.n_y)
+        past = {"y": y, "u": u, "v": v, "r": y, "y_model": y, "u_model": u, "w": r}
+        parts = {
+            name: np.broadcast_to(value, layout.shapes[name])
+            for name, value in past.items()
+            if name in layout
+        }
+        vector = layout.pack(**parts)
+        if "estimate" in layout:
+            vector[layout["estimate"]] = self._estimate_at_rest(y)
+        if "integral" in layout and (np.any(y) or np.any(u)):
+            vector = self._track(vector, u, np.tile(y, 1 + self.preview))
+        empty = np.zeros(self.n_z), np.zeros(self.n_theta)
+        return Memory(vector, *empty, np.array(-1), np.array(False))
+
+    def measure(
+        self, memory: Memory, y: Array, r: Array, v: Array | None = None
+    ) -> Memory:
+        """Take in the measurements y_k (..., n_y), r_k (..., n_y) and v_k (..., n_v).
+
+        An entry of y or v that is not finite never enters: the model's prediction, or
+        the last v, takes its place, the sum of the error stands still, and ``decide``
+        continues the last plan.
+
+        Raises
+        ------
+        ValueError
+            If r is not finite.
+        """
+        recipe, layout = self.form.recipe, self.form.recipe.layout
+        if not np.isfinite(r).all():
+            raise ValueError(f"r = {r} is not finite")
+        y = np.asarray(y, dtype=float)
+        before = memory.vector
+        v = layout.read(before, "v")[..., 0, :] if v is None else np.asarray(v, float)
+        good = np.isfinite(y).all(axis=-1) & np.isfinite(v).all(axis=-1)
+        if not good.all():
+            y = np.where(np.isfinite(y), y, before @ recipe.forecast.T)
+            v = np.where(np.isfinite(v), v, layout.read(before, "v")[..., 0, :])
+        r = np.broadcast_to(r, y.shape)
+        now = np.concatenate([y, np.broadcast_to(v, (*y.shape[:-1], v.shape[-1])), r], -1)
+        vector = before @ recipe.carry.T + now @ recipe.enter.T
+        if "integral" in layout and not good.all():
+            kept = before[..., layout["integral"]]
+            part = vector[..., layout["integral"]]
+            vector[..., layout["integral"]] = np.where(good[..., None], part, kept)
+        return dataclasses.replace(memory, vector=vector, refused=~good)
+
+    def decide(
+        self, memory: Memory, r: Array | None = None, v: Array | None = None
+    ) -> Move:
+        """Choose u_k from what has been measured.
+
+        Parameters
+        ----------
+        memory : Memory
+            After ``measure``.
+        r : array (1 + preview, n_y) or (..., 1 + preview, n_y), optional
+            r_k, r_{k+1}, ... as far as the design reads ahead; r_k is held otherwise.
+        v : array (1 + forecast_steps, n_v), optional
+            v_k, v_{k+1}, ... when the design takes a forecast; v_k is held otherwise.
+
+        Raises
+        ------
+        ValueError
+            If r or v is not finite or has another shape.
+        """
+        layout = self.form.recipe.layout
+        single = memory.vector.ndim == 1
+        many = (
+            Memory(*(np.asarray(part)[None] for part in _parts(memory)))
+            if single
+            else memory
+        )
+        r_now = layout.read(many.vector, "r")
+        v_now = layout.read(many.vector, "v")[:, 0]
+        r_all = _ahead("r", r, r_now, 1 + self.preview)
+        v_all = _ahead("v", v, v_now, 1 + self.forecast_steps)
+        move = self._decide(many, r_all, v_all)
+        return Move(*(part[0] for part in _parts(move))) if single else move
+
+    def apply(
+        self, memory: Memory, u: Array, move: Move, seen: Array | None = None
+    ) -> Memory:
+        """Remember the input that was really applied.
+
+        Parameters
+        ----------
+        memory : Memory
+            The one ``decide`` was given.
+        u : array (..., n_u)
+            Input after every saturation, or set by hand.
+        move : Move
+            What ``decide`` returned.
+        seen : array (..., n_u), optional
+            Input that an internal model sees, if not u.
+        """
+        recipe, layout = self.form.recipe, self.form.recipe.layout
+        u = np.asarray(u, dtype=float)
+        vector = memory.vector
+        if "integral" in layout:
+            other = self._overruled(memory, u, move)
+            if other.any():
+                r = np.tile(layout.read(vector, "r"), 1 + self.preview)
+                tracked = self._track(vector, u, r)
+                vector = np.where(other[..., None], tracked, vector)
+        seen = u if seen is None else np.asarray(seen, dtype=float)
+        applied = np.concatenate([u, seen, move.governed], axis=-1)
+        vector = vector @ recipe.keep.T + applied @ recipe.store.T
+        return Memory(vector, move.decision, move.known, move.shift, memory.refused)
+
+    def _overruled(self, memory: Memory, u: Array, move: Move) -> Array:
+        """Loops (...) in which the sum of the error must follow the applied input."""
+        missed = np.abs(u - move.u).max(axis=-1)
+        overruled: Array = missed > 1e-9 * (1.0 + np.abs(u).max(axis=-1))
+        return overruled
+
+    def clip(self, u: Array, before: Array) -> Array:
+        """Nearest input within the limits, given the one before.
+
+        Where the level cannot be reached at the allowed rate, the rate wins.
+        """
+        u = np.clip(u, *self.limits_u)
+        low, high = self.limits_du
+        clipped: Array = np.clip(u, before + low, before + high)
+        return clipped
+
+    def last_input(self, vector: Array) -> Array:
+        """u_{k-1} (..., n_u) from a memory vector."""
+        return self.form.recipe.layout.read(vector, "u")[..., 0, :]
+
+    def _track(self, vector: Array, u: Array, r: Array) -> Array:
+        """Set the sum of the error so that the law without limits asks for ``u``."""
+        on_memory, on_r = self.free_law()
+        integral = self.form.recipe.layout["integral"]
+        wanted = u - vector @ on_memory.T - r @ on_r.T
+        tracked = np.array(vector)
+        tracked[..., integral] += wanted @ self._integral_inverse.T
+        return tracked
+
+    @cached_property
+    def _integral_inverse(self) -> Array:
+        on_memory, _ = self.free_law()
+        integral = self.form.recipe.layout["integral"]
+        return np.linalg.pinv(on_memory[:, integral])
+
+    def _estimate_at_rest(self, y: Array) -> Array:
+        form = self.form
+        still = np.vstack([np.eye(form.n_x) - form.A, form.C])
+        rest = np.concatenate([np.zeros(form.n_x), y])
+        estimate: Array = np.linalg.lstsq(still, rest, rcond=None)[0]
+        return estimate
+
+
+def signal(name: str, value: Array | None, size: int) -> Array:
+    """Check a vector of ``size`` channels; None is zero and a number fills it.
+
+    Raises
+    ------
+    ValueError
+        If it has another shape or is not finite.
+    """
+    if value is None:
+        return np.zeros(size)
+    array = np.asarray(value, dtype=float)
+    if array.ndim > 1 or (array.ndim == 1 and array.shape[0] != size):
+        raise ValueError(f"{name} has shape {array.shape}, expected ({size},)")
+    if not np.isfinite(array).all():
+        raise ValueError(f"{name} = {array} is not finite")
+    return np.broadcast_to(array, (size,)).copy()
+
+
+def _ahead(name: str, given: Array | None, now: Array, steps: int) -> Array:
+    """Values from sample k on, (loops, steps, channels); the present one is held."""
+    loops, channels = now.shape
+    if given is None:
+        return np.broadcast_to(now[:, None], (loops, steps, channels))
+    values = np.asarray(given, dtype=float)
+    if values.ndim == 1:
+        values = values[None]
+    if values.shape[-2] < steps or values.shape[-1] != channels:
+        raise ValueError(
+            f"{name} has shape {values.shape}, expected (..., {steps}, {channels}): the "
+            f"present value and {steps - 1} samples ahead"
+        )
+    if not np.isfinite(values).all():
+        raise ValueError(f"{name} is not finite at every step of the horizon")
+    return np.broadcast_to(values[..., :steps, :], (loops, steps, channels))
+
+
+def _parts(record: Memory | Move) -> list[Array]:
+    return [getattr(record, part.name) for part in dataclasses.fields(record)]

@@ -1,0 +1,852 @@
+"""Predictive controllers: one class, and one short function for each structure.
+
+A structure says what its state is, what drives the model along the horizon, what is
+weighed and what is limited (the table of the design document); everything else is
+shared.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Literal
+
+import numpy as np
+import scipy.linalg
+
+from nmss_lab.controller import Controller, Limits, Memory, Move, Status
+from nmss_lab.models import Array, DifferenceModel
+from nmss_lab.nmss import (
+    Form,
+    Layout,
+    differenced_form,
+    integral_of_error_form,
+    minimal_form,
+)
+from nmss_lab.predict import (
+    Affine,
+    Horizon,
+    cumulate,
+    decided,
+    difference,
+    known_part,
+    predict,
+)
+from nmss_lab.qp import (
+    Cost,
+    Limit,
+    QuadraticProgram,
+    Solution,
+    assemble,
+    find_backend,
+    solve,
+)
+
+Reading = Literal["held", "next", "preview", "zero"]
+"""What S holds: r_k repeated, r_{k+1} repeated, the true future, or nothing (the
+reference then enters through the sum of the error alone, as in PIP control)."""
+
+Forecast = Literal["held", "given"] | Callable[[Array, int], Array]
+"""Measured disturbances ahead: v_k held, handed to ``decide``, or a function of the
+latest values (ng + 1, n_v), v_k first, and of the number of samples ahead that
+returns (samples, n_v)."""
+
+Terminal = Literal["none", "equality", "lq"]
+
+
+@dataclass(frozen=True, eq=False)
+class Knowledge:
+    """Layout of the known vector theta and how it is made.
+
+    theta = from_memory m + from_r [r_k; r_{k+1}; ...] + from_v [v_k; v_{k+1}; ...]
+    """
+
+    layout: Layout
+    from_memory: Array
+    from_r: Array
+    from_v: Array
+
+
+@dataclass(frozen=True, eq=False)
+class PredictiveController(Controller):
+    """A design that decides by a quadratic program; frozen, and shared by many loops.
+
+    Parameters
+    ----------
+    model, form, limits : see ``Controller``
+    horizon : Horizon
+    program : QuadraticProgram
+    signals : mapping of str to Affine
+        Predicted "u" (Np n_u), "du" (Np n_u), "y" (Np n_y), and "w" and "beta" under
+        a governor.
+    knowledge : Knowledge
+    ranks : integer array (rows,)
+        Order in which rows give way when not all can be kept, the highest first;
+        -1 for rows that never do.
+    backend : str
+    forecast : "held", "given" or a function, see ``Forecast``
+    """
+
+    horizon: Horizon
+    program: QuadraticProgram
+    signals: Mapping[str, Affine]
+    knowledge: Knowledge
+    ranks: Array
+    backend: str = "daqp"
+    forecast: Forecast = "held"
+
+    @property
+    def n_z(self) -> int:
+        """Number of decision variables."""
+        return self.program.n_z
+
+    @property
+    def n_theta(self) -> int:
+        """Size of the known vector."""
+        return self.knowledge.layout.size
+
+    @property
+    def preview(self) -> int:
+        """How many samples of r beyond r_k are read."""
+        return self.knowledge.from_r.shape[1] // self.model.n_y - 1
+
+    @property
+    def forecast_steps(self) -> int:
+        """How many samples of v beyond v_k are read."""
+        return max(self.knowledge.from_v.shape[1] // max(self.model.n_v, 1) - 1, 0)
+
+    @cached_property
+    def first_move(self) -> Affine:
+        """u_k as a function of decision and known vector."""
+        return self.signals["u"][: self.model.n_u]
+
+    @cached_property
+    def free_gain(self) -> Array:
+        """Gain (n_u, n_theta) of u_k on the known vector without active limits."""
+        free: Array = self.first_move.gain @ self.program.free + self.first_move.known
+        return free
+
+    def free_law(self) -> tuple[Array, Array]:
+        """First move without limits: gains on the memory and on r_k, r_{k+1}, ..."""
+        knows = self.knowledge
+        return self.free_gain @ knows.from_memory, self.free_gain @ knows.from_r
+
+    def plan(self, move: Move, name: str) -> Array:
+        """Predicted signal ("u", "du", "y", ...) of a move, (..., Np, channels).
+
+        A plan that was continued after a failure is shifted to the present sample,
+        its last value repeated.
+        """
+        flat = self.signals[name].value(move.decision, move.known)
+        steps = self.signals[name].gain.shape[0]
+        width = steps // self.horizon.Np
+        plan = flat.reshape(*flat.shape[:-1], self.horizon.Np, width)
+        shift = np.maximum(np.asarray(move.shift), 0)[..., None]
+        step = np.minimum(np.arange(self.horizon.Np) + shift, self.horizon.Np - 1)
+        return np.take_along_axis(plan, step[..., None], axis=-2)
+
+    def _decide(self, memory: Memory, r: Array, v: Array) -> Move:
+        theta = self._known(memory.vector, r, v)
+        z = theta @ self.program.free.T
+        kept = (self.program.room(z, theta) >= -self.program.slack).all(axis=-1)
+        loops = len(theta)
+        move = Move(
+            u=self.first_move.value(z, theta),
+            w=r[:, 0].copy(),
+            governed=r[:, 0].copy(),
+            decision=z,
+            known=theta,
+            status=np.full(loops, Status.FREE),
+            cost=np.zeros(loops),
+            active=np.zeros((loops, len(self.program.labels)), dtype=bool),
+            iterations=np.zeros(loops, dtype=int),
+            shift=np.zeros(loops, dtype=int),
+        )
+        for i in np.flatnonzero(~kept | memory.refused):
+            self._decide_limited(move, memory, i)
+        return self._finish(move, memory)
+
+    def _known(self, vector: Array, r: Array, v: Array) -> Array:
+        knows, loops = self.knowledge, len(vector)
+        theta: Array = vector @ knows.from_memory.T
+        if knows.from_r.any():
+            theta += r.reshape(loops, -1) @ knows.from_r.T
+        if knows.from_v.any():
+            if callable(self.forecast):
+                v = self._ask_forecast(self.forecast, vector)
+            theta += v.reshape(loops, -1) @ knows.from_v.T
+        return theta
+
+    def _ask_forecast(
+        self, forecast: Callable[[Array, int], Array], vector: Array
+    ) -> Array:
+        """v_k, v_{k+1}, ... of every loop, (loops, 1 + forecast_steps, n_v)."""
+        latest = self.form.recipe.layout.read(vector, "v")
+        steps = self.forecast_steps
+        ahead = np.array([np.asarray(forecast(v, steps), float) for v in latest])
+        if ahead.shape != (len(vector), steps, self.model.n_v):
+            raise ValueError(
+                f"forecast returned shape {ahead.shape[1:]}, expected "
+                f"({steps}, {self.model.n_v})"
+            )
+        if not np.isfinite(ahead).all():
+            raise ValueError("forecast returned values that are not finite")
+        return np.concatenate([latest[:, :1], ahead], axis=1)
+
+    def _decide_limited(self, move: Move, memory: Memory, i: int) -> None:
+        """Fill in row i, where the free optimum breaks a limit or cannot be had."""
+        before = self.last_input(memory.vector[i])
+        if memory.refused[i]:
+            self._continue(move, memory, i, before, Status.REFUSED)
+            return
+        solution, status = self._solve(move.known[i], self._reachable(before))
+        if not solution.found:
+            self._continue(move, memory, i, before, Status.SHIFTED)
+            return
+        move.decision[i] = solution.decision
+        move.u[i] = self.first_move.value(solution.decision, move.known[i])
+        move.status[i] = status
+        move.active[i] = solution.active
+        move.iterations[i] = solution.iterations
+
+    def _continue(
+        self, move: Move, memory: Memory, i: int, before: Array, status: Status
+    ) -> None:
+        """Fall back on the last plan, or hold the input where there is none."""
+        if memory.shift[i] < 0:
+            move.decision[i] = 0.0
+            move.u[i], move.status[i], move.shift[i] = before, Status.HELD, -1
+            return
+        move.decision[i], move.known[i] = memory.decision[i], memory.known[i]
+        move.shift[i], move.status[i] = memory.shift[i] + 1, status
+        step = min(int(move.shift[i]), self.horizon.Np - 1)
+        u = self.signals["u"].value(move.decision[i], move.known[i])
+        move.u[i] = u.reshape(self.horizon.Np, -1)[step]
+
+    def _finish(self, move: Move, memory: Memory) -> Move:
+        """Apply the input's limits once more and state the cost."""
+        clipped = self.clip(move.u, self.last_input(memory.vector))
+        cut = np.abs(clipped - move.u).max(axis=-1) > 1e-6
+        move.status[cut & (move.status < Status.CLIPPED)] = Status.CLIPPED
+        move.u[:] = clipped
+        move.cost[:] = self.program.cost(move.decision, move.known)
+        return move
+
+    def _solve(
+        self, theta: Array, bounds: tuple[Array, Array]
+    ) -> tuple[Solution, Status]:
+        """Solve with all rows; if that fails let rows give way as the limits say."""
+        if self.limits.outputs == "soft" and self._giving.size:
+            return self._solve_relaxed(theta, bounds)
+        solution = solve(self.program, theta, self.backend, bounds)
+        if solution.found or not self._giving.size:
+            return solution, Status.LIMITED
+        if self.limits.outputs == "priority" or (self.ranks == 0).any():
+            return self._solve_by_rank(theta, bounds)
+        return self._solve_without(theta, bounds)
+
+    @cached_property
+    def _giving(self) -> Array:
+        return np.flatnonzero(self.ranks >= 0)
+
+    @cached_property
+    def _without_outputs(self) -> QuadraticProgram:
+        names = {self.program.labels[i].name for i in self._giving}
+        return self.program.without(*names)
+
+    def _solve_without(
+        self, theta: Array, bounds: tuple[Array, Array]
+    ) -> tuple[Solution, Status]:
+        """Drop the rows that may give way (6.1.2)."""
+        keep = self.ranks < 0
+        low, high = bounds
+        solution = solve(
+            self._without_outputs, theta, self.backend, (low[keep], high[keep])
+        )
+        multipliers = np.zeros(len(keep))
+        multipliers[keep] = solution.multipliers
+        return _cut(solution, self.n_z, multipliers), Status.DROPPED
+
+    @cached_property
+    def _relaxed(self) -> QuadraticProgram:
+        weight = np.full(self._giving.size, self.limits.soft_weight)
+        return self.program.softened(self._giving, weight)
+
+    def _solve_relaxed(
+        self, theta: Array, bounds: tuple[Array, Array]
+    ) -> tuple[Solution, Status]:
+        """Pay a quadratic price for breaking output limits."""
+        solution = solve(self._relaxed, theta, self.backend, bounds)
+        broken = np.abs(solution.decision[self.n_z :]).max(initial=0.0) > 1e-6
+        status = Status.SOFTENED if broken else Status.LIMITED
+        return _cut(solution, self.n_z, solution.multipliers), status
+
+    def _solve_by_rank(
+        self, theta: Array, bounds: tuple[Array, Array]
+    ) -> tuple[Solution, Status]:
+        """Break each rank of rows as little as the more important ones allow."""
+        low, high = bounds[0].copy(), bounds[1].copy()
+        for rank in np.unique(self.ranks[self._giving]):
+            rows = np.flatnonzero(self.ranks == rank)
+            later = self.ranks > rank
+            free = np.where(later, -np.inf, low), np.where(later, np.inf, high)
+            weight = np.full(rows.size, 1e6 * np.abs(self.program.H).max())
+            program = self.program.softened(rows, weight)
+            solution = solve(program, theta, self.backend, free)
+            if not solution.found:
+                return solution, Status.SHIFTED
+            missed = np.abs(solution.decision[self.n_z :]) + 1e-7
+            low[rows], high[rows] = low[rows] - missed, high[rows] + missed
+        solution = solve(self.program, theta, self.backend, (low, high))
+        return solution, Status.SOFTENED
+
+    def _reachable(self, before: Array) -> tuple[Array, Array]:
+        """Bounds of the rows, level limits widened to what the rates can reach."""
+        low, high = self.program.lower, self.program.upper
+        if ((before >= self.limits_u[0]) & (before <= self.limits_u[1])).all():
+            return low, high
+        low, high = low.copy(), high.copy()
+        for row, (name, channel, step) in enumerate(self.program.labels):
+            if name == "u":
+                moves = 1 + np.searchsorted(self._move_steps, step)
+                slowest, fastest = (side[channel] for side in self.limits_du)
+                high[row] = max(high[row], before[channel] + moves * slowest)
+                low[row] = min(low[row], before[channel] + moves * fastest)
+        return low, high
+
+    @cached_property
+    def _move_steps(self) -> Array:
+        return np.unique([row.step for row in self.program.labels if row.name == "u"])
+
+
+def _cut(solution: Solution, n_z: int, multipliers: Array) -> Solution:
+    """Solution without slack variables and with multipliers for the original rows."""
+    return Solution(
+        solution.decision[:n_z],
+        multipliers,
+        solution.status,
+        solution.iterations,
+        solution.residual,
+        solution.message,
+    )
+
+
+def integral_of_error(
+    model: DifferenceModel,
+    horizon: Horizon,
+    Q: Any,
+    R: Any,
+    limits: Limits | None = None,
+    reference: Reading = "held",
+    terminal: Terminal = "none",
+    backend: str = "daqp",
+) -> PredictiveController:
+    r"""Predictive control with an integral-of-error state (thesis 4.2).
+
+    .. math:: J = X' \bar Q X + U' \bar R U
+
+    over the state of (3.2) and the inputs themselves; the last input is held.
+
+    Parameters
+    ----------
+    model : DifferenceModel
+    horizon : Horizon
+    Q : weight of the state, n_x = n_y (na + 1) + n_u (nb - 1)
+        A number, one weight a state, a matrix (n_x, n_x), one matrix a step
+        (Np, n_x, n_x), or the full (Np n_x, Np n_x); see ``state_weight`` for (5.6).
+    R : weight of the inputs, the same ways with n_u and Nc
+    limits : Limits, optional
+    reference : "held", "next", "preview" or "zero"
+        What is known of the reference along the horizon.
+    terminal : "none", "equality" or "lq"
+        ``"equality"`` asks for rest at the reference at the end of the horizon (C.2.1),
+        ``"lq"`` weighs the last state with the infinite-horizon LQ cost.
+    backend : str
+        Solver, see ``nmss_lab.qp.BACKENDS``.
+
+    Raises
+    ------
+    ValueError
+        If a weight or limit has a wrong shape, or the condensed Hessian is not
+        positive definite.
+    """
+    form = integral_of_error_form(model)
+    problem = _Setup(model, form, horizon, reference, "held")
+    U = problem.free_moves(horizon.held(model.n_u))
+    steps = [U[_block(i, model.n_u)] for i in range(horizon.Np)]
+    offsets = [form.D @ r for r in problem.reference]
+    X = problem.predicted(steps, offsets)
+    weight_x = weight("Q", Q, horizon.Np, form.n_x)
+    weight_u = weight("R", R, horizon.Nc, model.n_u)
+    if terminal == "lq":
+        last = slice((horizon.Np - 1) * form.n_x, None)
+        weight_x[last, last] = _riccati(form, weight_x[last, last], weight_u, model.n_u)
+    costs = [Cost(X, weight_x), Cost(problem.decision, weight_u)]
+    first = np.eye(horizon.Np * model.n_u, model.n_u)
+    last_u = first @ known_part(problem.known, "u", problem.n_z)
+    dU = difference(horizon.Np, model.n_u) @ U - last_u
+    return problem.build(costs, U, dU, X, limits, terminal, backend)
+
+
+def wang_young(
+    model: DifferenceModel,
+    horizon: Horizon,
+    Q: Any,
+    R: Any,
+    limits: Limits | None = None,
+    reference: Reading = "held",
+    terminal: Terminal = "none",
+    backend: str = "daqp",
+) -> PredictiveController:
+    r"""Predictive control of Wang and Young (2006), thesis 4.1.
+
+    .. math:: J = (Y - S)' \bar Q (Y - S) + \Delta U' \bar R \Delta U
+
+    Changes of the input are decided; after the control horizon they are zero.
+
+    Parameters
+    ----------
+    Q, R : weights of outputs (n_y, over Np) and of moves (n_u, over Nc)
+        A number, one weight a channel, a matrix, one matrix a step (5.4), or full.
+    model, horizon, limits, reference, terminal, backend :
+        See ``integral_of_error``; ``reference = "zero"`` makes no sense here.
+
+    Raises
+    ------
+    ValueError
+        As ``integral_of_error``.
+    """
+    form = differenced_form(model)
+    return _incremental(
+        model, form, horizon, Q, R, limits, reference, terminal, backend
+    )
+
+
+def forward_path(
+    model: DifferenceModel,
+    horizon: Horizon,
+    Q: Any,
+    R: Any,
+    limits: Limits | None = None,
+    reference: Reading = "held",
+    terminal: Terminal = "none",
+    backend: str = "daqp",
+) -> PredictiveController:
+    """Forward-path predictive control (thesis 6.2).
+
+    The design of ``wang_young``; only the state differs: changes of past outputs come
+    from an internal model, and the last entries stay the measured outputs.  All
+    open-loop poles remain as hidden modes of the loop, so the model must be stable.
+
+    Parameters and errors are those of ``wang_young``.
+    """
+    form = differenced_form(model, internal_model=True)
+    return _incremental(
+        model, form, horizon, Q, R, limits, reference, terminal, backend
+    )
+
+
+def minimal(
+    model: DifferenceModel,
+    horizon: Horizon,
+    Q: Any,
+    R: Any,
+    limits: Limits | None = None,
+    reference: Reading = "held",
+    terminal: Terminal = "none",
+    backend: str = "daqp",
+    observer: Literal["deadbeat", "kalman"] = "deadbeat",
+) -> PredictiveController:
+    """Predictive control on a minimal realisation with an observer (5.1.3).
+
+    The cost is that of ``wang_young``; see ``nmss_lab.nmss.minimal_form`` for the
+    observers.
+    """
+    form = minimal_form(model, observer)
+    return _incremental(
+        model, form, horizon, Q, R, limits, reference, terminal, backend
+    )
+
+
+def disturbance_direct(
+    model: DifferenceModel,
+    horizon: Horizon,
+    Q: Any,
+    R: Any,
+    limits: Limits | None = None,
+    reference: Reading = "held",
+    terminal: Terminal = "none",
+    backend: str = "daqp",
+    forecast: Forecast = "held",
+) -> PredictiveController:
+    """Measured disturbances as known offsets of the prediction (thesis 7.2.2).
+
+    ``forecast`` says what is known of v beyond v_k: it is held (Assumption 7.3.1),
+    handed to ``decide`` ("given"), or asked of a function, see ``Forecast``.
+
+    Raises
+    ------
+    ValueError
+        As ``wang_young``, or if the model has no measured disturbances.
+    """
+    form = differenced_form(_with_disturbances(model), disturbances="direct")
+    return _incremental(
+        model, form, horizon, Q, R, limits, reference, terminal, backend, forecast
+    )
+
+
+def disturbance_augmented(
+    model: DifferenceModel,
+    horizon: Horizon,
+    Q: Any,
+    R: Any,
+    limits: Limits | None = None,
+    reference: Reading = "held",
+    terminal: Terminal = "none",
+    backend: str = "daqp",
+    forecast: Forecast = "held",
+) -> PredictiveController:
+    """Measured disturbances as part of the state (thesis 7.2.1, corrected).
+
+    Written so that the present increment counts once, it is the same controller as
+    ``disturbance_direct`` with a larger state.
+    """
+    form = differenced_form(_with_disturbances(model), disturbances="augmented")
+    return _incremental(
+        model, form, horizon, Q, R, limits, reference, terminal, backend, forecast
+    )
+
+
+STRUCTURES: dict[str, Callable[..., PredictiveController]] = {
+    "integral_of_error": integral_of_error,
+    "wang_young": wang_young,
+    "forward_path": forward_path,
+    "minimal": minimal,
+    "disturbance_direct": disturbance_direct,
+    "disturbance_augmented": disturbance_augmented,
+}
+"""Predictive structures by name."""
+
+
+def _incremental(
+    model: DifferenceModel,
+    form: Form,
+    horizon: Horizon,
+    Q: Any,
+    R: Any,
+    limits: Limits | None,
+    reference: Reading,
+    terminal: Terminal,
+    backend: str,
+    forecast: Forecast = "held",
+) -> PredictiveController:
+    """Build any structure whose decision is the change of the input."""
+    if reference == "zero":
+        raise ValueError(
+            'reference = "zero" leaves nothing to follow: a structure that decides '
+            'changes of the input has no sum of the error; use "held", "next" or '
+            '"preview"'
+        )
+    problem = _Setup(model, form, horizon, reference, forecast)
+    dU = problem.free_moves(horizon.impulses(model.n_u))
+    steps = [dU[_block(i, model.n_u)] for i in range(horizon.Np)]
+    X = problem.predicted(steps, problem.disturbances())
+    weight_y = weight("Q", Q, horizon.Np, model.n_y)
+    weight_du = weight("R", R, horizon.Nc, model.n_u)
+    Y = np.kron(np.eye(horizon.Np), form.C) @ X
+    S = problem.stacked_reference()
+    costs = [Cost(Y - S, weight_y), Cost(problem.decision, weight_du)]
+    if terminal == "lq":
+        costs.append(_tail(problem, X, weight_y, weight_du))
+    ones = np.tile(np.eye(model.n_u), (horizon.Np, 1))
+    last_u = ones @ known_part(problem.known, "u", problem.n_z)
+    U = cumulate(horizon.Np, model.n_u) @ dU + last_u
+    return problem.build(costs, U, dU, X, limits, terminal, backend)
+
+
+class _Setup:
+    """What the builders share: the known vector, the reference, limits, assembly."""
+
+    def __init__(
+        self,
+        model: DifferenceModel,
+        form: Form,
+        horizon: Horizon,
+        reference: Reading,
+        forecast: Forecast,
+    ) -> None:
+        self.model, self.form, self.horizon = model, form, horizon
+        self.reading, self.forecast = reference, forecast
+        self.n_z = horizon.Nc * model.n_u
+        self.known = self._layout()
+        self.decision = decided(np.eye(self.n_z), self.known)
+
+    def _layout(self) -> Layout:
+        sizes = {"held": 1, "next": 1, "preview": self.horizon.Np, "zero": 0}
+        if self.reading not in sizes:
+            raise ValueError(
+                f'reference = "{self.reading}": expected one of {", ".join(sizes)}'
+            )
+        if not (callable(self.forecast) or self.forecast in ("held", "given")):
+            raise ValueError(
+                f'forecast = "{self.forecast}": expected "held", "given" or a function'
+            )
+        model = self.model
+        return Layout(
+            x=self.form.n_x,
+            u=model.n_u,
+            r=(sizes[self.reading], model.n_y),
+            dv=(self._past, model.n_v),
+            dv_ahead=(self._ahead, model.n_v),
+        )
+
+    @property
+    def _past(self) -> int:
+        """Past changes of v that enter the prediction, the present one included."""
+        return max((lag + 1 for lag in self.form.lags), default=0)
+
+    @property
+    def _ahead(self) -> int:
+        """Coming changes of v that enter the prediction."""
+        held = self.forecast == "held" or not self.form.lags
+        return 0 if held else self.horizon.Np - 1
+
+    def free_moves(self, spread: Array) -> Affine:
+        """Sequence over the horizon made of the decision alone."""
+        return decided(spread, self.known)
+
+    @property
+    def reference(self) -> list[Affine]:
+        """S, step by step: r_{k+i+1} as far as it is known, n_y rows each."""
+        part, p = known_part(self.known, "r", self.n_z), self.model.n_y
+        if self.reading == "zero":
+            nothing = Affine(np.zeros((p, self.n_z)), np.zeros((p, self.known.size)))
+            return [nothing] * self.horizon.Np
+        if self.reading == "preview":
+            return [part[_block(i, p)] for i in range(self.horizon.Np)]
+        return [part] * self.horizon.Np
+
+    def stacked_reference(self) -> Affine:
+        """S as one signal of Np n_y rows."""
+        steps = self.reference
+        return Affine(
+            np.concatenate([s.gain for s in steps]),
+            np.concatenate([s.known for s in steps]),
+        )
+
+    def disturbances(self) -> list[Affine]:
+        """Offsets G delta_{k+i} of each step of the horizon, n_x rows each."""
+        past = known_part(self.known, "dv", self.n_z)
+        ahead = known_part(self.known, "dv_ahead", self.n_z)
+        r, n_x = self.model.n_v, self.form.n_x
+        nothing = Affine(np.zeros((n_x, self.n_z)), np.zeros((n_x, self.known.size)))
+        offsets = [nothing] * self.horizon.Np
+        for i in range(self.horizon.Np):
+            for j, lag in enumerate(self.form.lags):
+                source, block = (past, lag - i) if i <= lag else (ahead, i - lag - 1)
+                if (block + 1) * r <= len(source):
+                    G = self.form.G[:, _block(j, r)]
+                    offsets[i] = offsets[i] + G @ source[_block(block, r)]
+        return offsets
+
+    def predicted(self, inputs: list[Affine], offsets: list[Affine]) -> Affine:
+        """States over the horizon, Np n_x rows."""
+        steps = self.horizon.Np
+        state = known_part(self.known, "x", self.n_z)
+        A, B = [self.form.A] * steps, [self.form.B] * steps
+        return predict(A, B, state, inputs, offsets)
+
+    def build(
+        self,
+        costs: list[Cost],
+        U: Affine,
+        dU: Affine,
+        X: Affine,
+        limits: Limits | None,
+        terminal: Terminal,
+        backend: str,
+    ) -> PredictiveController:
+        """Condense costs and limits and freeze the design."""
+        model, horizon = self.model, self.horizon
+        limits = limits or Limits()
+        find_backend(backend)
+        Y = np.kron(np.eye(horizon.Np), self.form.C) @ X
+        moves, steps = horizon.rows_of_moves(model.n_u), np.arange(horizon.Np)
+        rows = [
+            limit("u", U[moves], limits.of("u", model.n_u), horizon.starts),
+            limit("du", dU[moves], limits.of("du", model.n_u), horizon.starts),
+            limit("y", Y, limits.of("y", model.n_y), steps),
+        ]
+        if terminal == "equality":
+            rows.append(self._rest(Y, dU))
+        elif terminal not in ("none", "lq"):
+            raise ValueError(
+                f'terminal = "{terminal}": expected "none", "equality" or "lq"'
+            )
+        program = assemble(costs, rows, "weights Q and R")
+        return PredictiveController(
+            model,
+            self.form,
+            limits,
+            horizon,
+            program,
+            {"u": U, "du": dU, "y": Y},
+            self.knowledge(),
+            output_ranks(program, limits, model.n_y),
+            backend,
+            self.forecast,
+        )
+
+    def _rest(self, Y: Affine, dU: Affine) -> Limit:
+        """Equality rows of (C.2.1): na + 1 outputs at r, nb - 1 inputs without change."""
+        model, Np = self.model, self.horizon.Np
+        outputs = min(model.na + 1, Np) * model.n_y
+        inputs = min(model.nb - 1, Np) * model.n_u
+        error = (Y - self.stacked_reference())[slice(Np * model.n_y - outputs, None)]
+        still = dU[slice(Np * model.n_u - inputs, None)]
+        signal = Affine(
+            np.concatenate([error.gain, still.gain]),
+            np.concatenate([error.known, still.known]),
+        )
+        zero = np.zeros(len(signal))
+        return Limit("terminal", signal, zero, zero, 1, np.full(len(signal), Np - 1))
+
+    def knowledge(self) -> Knowledge:
+        """How theta is made of memory, reference and disturbances."""
+        model, recipe, known = self.model, self.form.recipe, self.known
+        p, r = model.n_y, model.n_v
+        from_memory = np.zeros((known.size, recipe.layout.size))
+        from_memory[known["x"]] = recipe.state
+        from_memory[known["u"]] = recipe.layout.select("u")[: model.n_u]
+        if self._past:
+            v = recipe.layout.select("v")
+            from_memory[known["dv"]] = (v[:-r] - v[r:])[: self._past * r]
+        reads = {"held": 0, "zero": 0, "next": 1, "preview": self.horizon.Np}
+        from_r = np.zeros((known.size, (1 + reads[self.reading]) * p))
+        if self.reading == "held":
+            from_memory[known["r"]] = recipe.layout.select("r")
+        elif self.reading != "zero":
+            from_r[known["r"], p:] = np.eye(reads[self.reading] * p)
+        from_v = np.zeros((known.size, (1 + self._ahead) * r))
+        if self._ahead:
+            changes = np.eye(self._ahead * r, from_v.shape[1], k=r)
+            changes -= np.eye(self._ahead * r, from_v.shape[1])
+            from_v[known["dv_ahead"]] = changes
+        return Knowledge(known, from_memory, from_r, from_v)
+
+
+def limit(
+    name: str, signal: Affine, sides: tuple[Array, Array], steps: Array
+) -> Limit:
+    """Limit with the same sides (n,) at each of the steps."""
+    low, high = sides
+    return Limit(
+        name, signal, np.tile(low, len(steps)), np.tile(high, len(steps)), len(low), steps
+    )
+
+
+def output_ranks(program: QuadraticProgram, limits: Limits, n_y: int) -> Array:
+    """Order in which output and terminal rows give way; -1 for input rows."""
+    ranks = limits.ranks(n_y)
+    last = int(ranks.max()) + 1
+    order = {"y": lambda row: int(ranks[row.channel]), "terminal": lambda row: last}
+    return np.array(
+        [order[row.name](row) if row.name in order else -1 for row in program.labels],
+        dtype=int,
+    )
+
+
+def weight(name: str, value: Any, steps: int, size: int) -> Array:
+    """Block-diagonal weight (steps size, steps size), symmetric.
+
+    Accepts a number, one weight a channel (size,), a matrix (size, size), one number a
+    step (steps,) for a single channel, one matrix a step (steps, size, size), or the
+    full matrix.
+
+    Raises
+    ------
+    ValueError
+        If the shape is another, or an entry is not finite.
+    """
+    array = np.asarray(value, dtype=float)
+    if not np.isfinite(array).all():
+        raise ValueError(f"{name} holds entries that are not finite")
+    if array.shape == (steps * size, steps * size) and steps > 1:
+        return (array + array.T) / 2.0
+    if size == 1 and array.shape == (steps,):
+        array = array[:, None, None]
+    if array.ndim == 0:
+        array = array * np.eye(size)
+    if array.shape == (size,):
+        array = np.diag(array)
+    if array.shape == (size, size):
+        array = np.broadcast_to(array, (steps, size, size))
+    if array.shape != (steps, size, size):
+        raise ValueError(
+            f"{name} has shape {np.shape(value)}, expected a number, ({size},), "
+            f"({size}, {size}), ({steps}, {size}, {size}) or the full "
+            f"({steps * size}, {steps * size})"
+        )
+    full: Array = scipy.linalg.block_diag(*((step + step.T) / 2.0 for step in array))
+    return full
+
+
+def state_weight(
+    model: DifferenceModel, weight_y: Any, weight_past_u: Any, weight_integral: Any
+) -> Array:
+    """Weight (n_x, n_x) of the state of (3.2), by its parts: (5.6a).
+
+    Each part is a number, one weight a channel, or a matrix.
+    """
+    parts = [weight("weight_y", weight_y, model.na, model.n_y)]
+    if model.nb > 1:
+        parts.append(weight("weight_past_u", weight_past_u, model.nb - 1, model.n_u))
+    parts.append(weight("weight_integral", weight_integral, 1, model.n_y))
+    joined: Array = scipy.linalg.block_diag(*parts)
+    return joined
+
+
+def lq_cost(A: Array, B: Array, Q: Array, R: Array) -> Array:
+    """Infinite-horizon cost matrix P of x'Qx + u'Ru.
+
+    Raises
+    ------
+    ValueError
+        If the Riccati equation has no stabilising solution.
+    """
+    try:
+        P: Array = scipy.linalg.solve_discrete_are(A, B, Q, R)
+    except (np.linalg.LinAlgError, ValueError) as error:
+        raise ValueError(
+            "the LQ problem has no stabilising solution: an unstable mode is not "
+            f"reached by the input or not seen by the weights ({error})"
+        ) from error
+    return P
+
+
+def _riccati(form: Form, Q: Array, R: Array, n_u: int) -> Array:
+    """Cost-to-go from the last state; the cost counts x_{k+Np} itself as well."""
+    return lq_cost(form.A, form.B, Q, R[-n_u:, -n_u:])
+
+
+def _tail(problem: _Setup, X: Affine, weight_y: Array, weight_du: Array) -> Cost:
+    """LQ cost beyond the horizon, on the last state seen from rest at r."""
+    form, model, Np = problem.form, problem.model, problem.horizon.Np
+    last_y, last_u = slice(-model.n_y, None), slice(-model.n_u, None)
+    Q = form.C.T @ weight_y[last_y, last_y] @ form.C
+    P = lq_cost(form.A, form.B, Q, weight_du[last_u, last_u])
+    still = np.vstack([np.eye(form.n_x) - form.A, form.C])
+    rest = np.linalg.pinv(still)[:, form.n_x :]
+    x_last = X[_block(Np - 1, form.n_x)] - rest @ problem.reference[-1]
+    return Cost(x_last, P - Q)
+
+
+def _with_disturbances(model: DifferenceModel) -> DifferenceModel:
+    if model.n_v == 0:
+        raise ValueError("model.g is missing: the model has no measured disturbances")
+    return model
+
+
+def _block(i: int, size: int) -> slice:
+    return slice(i * size, (i + 1) * size)

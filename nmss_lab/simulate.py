@@ -1,0 +1,492 @@
+"""The closed loop: one sample at a time, a whole run, or an ensemble in lock step."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from nmss_lab.controller import Controller, Memory, Move, Status
+from nmss_lab.models import Array, LinearPlant, Plant
+from nmss_lab.mpc import PredictiveController
+
+
+@dataclass(frozen=True, eq=False)
+class Scenario:
+    """What happens to a loop over N samples.
+
+    Parameters
+    ----------
+    reference : array (N, n_y)
+        r_k.  Beyond the end the last value is held; whether the controller reads ahead
+        is the design's ``reference`` option.
+    v : array (N, n_v), optional
+        Measured disturbances; v_k is measured before u_k is computed.
+    input_disturbance, output_disturbance : arrays (N, n_u), (N, n_y), optional
+        Not measured; added to the input of the plant, and to its output.
+    noise : array (N, n_y), optional
+        Added to what is measured only.
+    manual : array (N, n_u), optional
+        Inputs set by hand where finite; nan where the controller acts.
+    actuator : pair (low, high), optional
+        Limits of the actuator that the controller need not know of.
+    seen : bool
+        Whether an internal model is driven by the disturbed input.
+    y0, u0, v0 : arrays (n_y,), (n_u,), (n_v,), optional
+        Constant past; y0 is left to the plant's equilibrium where it is not given.
+
+    Raises
+    ------
+    ValueError
+        If lengths differ, or a value other than noise or manual is not finite.
+    """
+
+    reference: Array
+    v: Array | None = None
+    input_disturbance: Array | None = None
+    output_disturbance: Array | None = None
+    noise: Array | None = None
+    manual: Array | None = None
+    actuator: tuple[Any, Any] = (-np.inf, np.inf)
+    seen: bool = False
+    y0: Array | None = None
+    u0: Array | None = None
+    v0: Array | None = None
+
+    def __post_init__(self) -> None:
+        """Check lengths and make every series two-dimensional."""
+        r = _series("reference", self.reference)
+        object.__setattr__(self, "reference", r)
+        for name in ("v", "input_disturbance", "output_disturbance", "noise", "manual"):
+            value = getattr(self, name)
+            if value is None:
+                continue
+            series = _series(name, value, finite=name not in ("noise", "manual"))
+            if len(series) != len(r):
+                raise ValueError(
+                    f"{name} has {len(series)} samples, expected {len(r)} as in "
+                    "reference"
+                )
+            object.__setattr__(self, name, series)
+
+    def __len__(self) -> int:
+        """Number of samples."""
+        return len(self.reference)
+
+    def of(self, name: str, channels: int) -> Array:
+        """Series (N, channels); zero where the scenario states none.
+
+        Raises
+        ------
+        ValueError
+            If the series has another number of channels.
+        """
+        value = getattr(self, name)
+        if value is None:
+            fill = np.nan if name == "manual" else 0.0
+            return np.full((len(self), channels), fill)
+        if value.shape[1] != channels:
+            raise ValueError(
+                f"{name} has {value.shape[1]} columns, expected {channels}"
+            )
+        series: Array = value
+        return series
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """Everything that happened in one closed loop; arrays, time first.
+
+    Parameters
+    ----------
+    controller : Controller
+    t : array (N,)
+        Seconds.
+    y, measured, w, r : arrays (N, n_y)
+        Output with its disturbance, the same with noise, governed and actual reference.
+    u, du : arrays (N, n_u)
+        Applied input and its change.
+    v : array (N, n_v)
+    status : integer array (N,)
+        Codes of ``Status``.
+    cost : array (N,)
+    active : bool array (N, rows)
+        Rows of the controller's program held by a limit.
+    iterations : integer array (N,)
+    moves : Move, optional
+        All decisions, one row a sample: ``trail`` reads predictions from them.
+    t_fine, y_fine : arrays (M,), (M, n_y)
+        Output between the samples; the sampled output where the plant gives no other.
+    """
+
+    controller: Controller
+    t: Array
+    y: Array
+    measured: Array
+    r: Array
+    w: Array
+    u: Array
+    du: Array
+    v: Array
+    status: Array
+    cost: Array
+    active: Array
+    iterations: Array
+    t_fine: Array
+    y_fine: Array
+    moves: Move | None = None
+
+    def __len__(self) -> int:
+        """Number of samples."""
+        return len(self.t)
+
+    def trail(self, name: str) -> Array:
+        """Predictions made at every sample: (N, Np, channels).
+
+        ``name`` is "y" (steps k+1 to k+Np) or "u", "du" (k to k+Np-1); "w", "beta"
+        under a governor.
+
+        Raises
+        ------
+        ValueError
+            If the run kept no moves, or the controller predicts no such signal.
+        """
+        controller = self.controller
+        if not isinstance(controller, PredictiveController) or self.moves is None:
+            raise ValueError("the run holds no predictions: its controller makes none")
+        if name not in controller.signals:
+            raise ValueError(
+                f'trail "{name}": this controller predicts '
+                f"{', '.join(controller.signals)}"
+            )
+        return controller.plan(self.moves, name)
+
+    @property
+    def sentences(self) -> list[str]:
+        """Each way in which moves came about, and how often."""
+        codes, counts = np.unique(self.status, return_counts=True)
+        return [
+            f"{count} of {len(self)}: {Status(int(code)).sentence}"
+            for code, count in zip(codes, counts, strict=True)
+        ]
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """One sample of a loop, as ``samples`` yields it; a leading axis for ensembles."""
+
+    k: int
+    y: Array
+    measured: Array
+    u: Array
+    move: Move
+    memory: Memory
+    between: Array | None
+
+
+def samples(
+    plant: Plant, controller: Controller, scenario: Scenario
+) -> Iterator[Sample]:
+    """Run the loop sample by sample; stop whenever you like.
+
+    Parameters
+    ----------
+    plant : Plant
+        A ``LinearPlant``, or anything with ``reset``, ``output`` and ``step``.
+    controller : Controller
+    scenario : Scenario
+
+    Yields
+    ------
+    Sample
+        Without a leading axis.
+
+    Raises
+    ------
+    ValueError
+        If plant, controller and scenario do not fit together.
+    """
+    ensemble = _Single(plant)
+    for sample in _lock_step(ensemble, controller, scenario):
+        move = Move(*(getattr(sample.move, n)[0] for n in Move.__dataclass_fields__))
+        memory = Memory(
+            *(getattr(sample.memory, n)[0] for n in Memory.__dataclass_fields__)
+        )
+        between = None if sample.between is None else sample.between[0]
+        yield Sample(
+            sample.k,
+            sample.y[0],
+            sample.measured[0],
+            sample.u[0],
+            move,
+            memory,
+            between,
+        )
+
+
+def closed_loop(plant: Plant, controller: Controller, scenario: Scenario) -> Run:
+    """Run the whole loop; see ``samples`` for the arguments and errors."""
+    return _collect(_Single(plant), controller, scenario, keep_moves=True)[0]
+
+
+def closed_loops(
+    plants: Sequence[LinearPlant],
+    controller: Controller,
+    scenario: Scenario,
+    keep_moves: bool = False,
+) -> list[Run]:
+    """Run one controller on many linear plants in lock step.
+
+    All unconstrained decisions of a sample are one matrix product; only loops whose
+    limits are hit go to a quadratic program.
+
+    Parameters
+    ----------
+    plants : sequence of LinearPlant
+        With equal sizes, as from one model with varied parameters.
+    controller, scenario : see ``samples``
+    keep_moves : bool
+        Keep all decisions, so that each run has its ``trail``.
+
+    Raises
+    ------
+    ValueError
+        If the plants' sizes differ or do not fit.
+    """
+    return _collect(_Stacked(plants), controller, scenario, keep_moves)
+
+
+class _Single:
+    """One plant of any kind as an ensemble of one."""
+
+    def __init__(self, plant: Plant) -> None:
+        self.plant, self.size = plant, 1
+        self.dt, self.n_y, self.n_u, self.n_v = plant.dt, plant.n_y, plant.n_u, plant.n_v
+        self.times = _times(plant)
+
+    def reset(self, u0: Array, v0: Array, y0: Array | None) -> Any:
+        return self.plant.reset(u0, v0, y0)
+
+    def output(self, state: Any) -> Array:
+        return np.asarray(self.plant.output(state), dtype=float)[None]
+
+    def step(self, state: Any, u: Array, v: Array) -> Any:
+        return self.plant.step(state, u[0], v[0])
+
+    def between(self, state: Any, u: Array, v: Array) -> Array | None:
+        """Outputs (1, m, n_y) between this sample and the next."""
+        if self.times is None:
+            return None
+        part = self.plant.between  # type: ignore[attr-defined]
+        inside: Array = part.C @ state + part.B @ u[0] + part.G @ v[0]
+        return inside[None]
+
+
+class _Stacked:
+    """Linear plants of equal size, their matrices stacked."""
+
+    def __init__(self, plants: Sequence[LinearPlant]) -> None:
+        if not plants:
+            raise ValueError("plants is empty, expected at least one LinearPlant")
+        first = plants[0]
+        self.plants, self.size = list(plants), len(plants)
+        self.dt, self.n_y, self.n_u, self.n_v = first.dt, first.n_y, first.n_u, first.n_v
+        shapes = {(p.A.shape, p.B.shape, p.C.shape, p.dt) for p in plants}
+        if len(shapes) > 1:
+            raise ValueError(f"plants differ in size or dt: {sorted(map(str, shapes))}")
+        self.A, self.B, self.C, self.G = (
+            np.stack([getattr(p, name) for p in plants]) for name in "ABCG"
+        )
+        self.times = _times(first)
+        if self.times is not None:
+            parts = [p.between for p in plants]
+            self.between_C, self.between_B, self.between_G = (
+                np.stack([getattr(part, name) for part in parts]) for name in "CBG"
+            )
+
+    def reset(self, u0: Array, v0: Array, y0: Array | None) -> Array:
+        return np.stack([plant.reset(u0, v0, y0) for plant in self.plants])
+
+    def output(self, state: Array) -> Array:
+        return _each(self.C, state)
+
+    def step(self, state: Array, u: Array, v: Array) -> Array:
+        return _each(self.A, state) + _each(self.B, u) + _each(self.G, v)
+
+    def between(self, state: Array, u: Array, v: Array) -> Array | None:
+        """Outputs (loops, m, n_y) between this sample and the next."""
+        if self.times is None:
+            return None
+        inside: Array = (
+            np.einsum("rmij,rj->rmi", self.between_C, state)
+            + np.einsum("rmij,rj->rmi", self.between_B, u)
+            + np.einsum("rmij,rj->rmi", self.between_G, v)
+        )
+        return inside
+
+
+def _each(matrices: Array, vectors: Array) -> Array:
+    product: Array = (matrices @ vectors[..., None])[..., 0]
+    return product
+
+
+def _times(plant: Any) -> Array | None:
+    between = getattr(plant, "between", None)
+    times: Array | None = None if between is None else between.times
+    return times
+
+
+def _lock_step(
+    plants: _Single | _Stacked, controller: Controller, scenario: Scenario
+) -> Iterator[Sample]:
+    """Advance all loops by one sample at a time."""
+    model = controller.model
+    _check_sizes(plants, controller)
+    names = "input_disturbance", "output_disturbance", "noise", "manual"
+    sizes = model.n_u, model.n_y, model.n_y, model.n_u
+    d_u, d_y, noise, manual = (
+        scenario.of(name, size) for name, size in zip(names, sizes, strict=True)
+    )
+    r = scenario.of("reference", model.n_y)
+    v = scenario.of("v", plants.n_v)
+    u0, v0 = _constant(scenario.u0, model.n_u), _constant(scenario.v0, plants.n_v)
+    state = plants.reset(u0, v0, scenario.y0)
+    y0 = plants.output(state)
+    memory = _start(controller, y0, u0, v0, r[0])
+    ahead_r = _padded(r, controller.preview)
+    ahead_v = _padded(v, controller.forecast_steps)
+    knows_v = model.n_v > 0
+    for k in range(len(scenario)):
+        y = plants.output(state) + d_y[k]
+        measured = y + noise[k]
+        memory = controller.measure(memory, measured, r[k], v[k] if knows_v else None)
+        move = controller.decide(
+            memory,
+            ahead_r[k : k + 1 + controller.preview],
+            ahead_v[k : k + 1 + controller.forecast_steps] if knows_v else None,
+        )
+        wanted = np.where(np.isfinite(manual[k]), manual[k], move.u)
+        u = np.clip(wanted, *scenario.actuator)
+        into = u + d_u[k]
+        loops_v = np.broadcast_to(v[k], (plants.size, plants.n_v))
+        inside = plants.between(state, into, loops_v)
+        yield Sample(k, y, measured, u, move, memory, inside)
+        memory = controller.apply(memory, u, move, into if scenario.seen else None)
+        state = plants.step(state, into, loops_v)
+
+
+def _start(
+    controller: Controller, y0: Array, u0: Array, v0: Array, r0: Array
+) -> Memory:
+    """Memories of all loops, stacked."""
+    known_v = v0 if controller.model.n_v else None
+    starts = [controller.start(y, u0, known_v, r0) for y in y0]
+    names = Memory.__dataclass_fields__
+    return Memory(*(np.stack([getattr(m, name) for m in starts]) for name in names))
+
+
+def _collect(
+    plants: _Single | _Stacked,
+    controller: Controller,
+    scenario: Scenario,
+    keep_moves: bool,
+) -> list[Run]:
+    taken = list(_lock_step(plants, controller, scenario))
+    moves = Move(
+        *(
+            np.stack([getattr(s.move, name) for s in taken], axis=1)
+            for name in Move.__dataclass_fields__
+        )
+    )
+    y = np.stack([s.y for s in taken], axis=1)
+    measured = np.stack([s.measured for s in taken], axis=1)
+    u = np.stack([s.u for s in taken], axis=1)
+    before = _constant(scenario.u0, controller.model.n_u)
+    du = np.diff(u, axis=1, prepend=np.broadcast_to(before, (len(u), 1, u.shape[2])))
+    t = np.arange(len(taken)) * plants.dt
+    t_fine, y_fine = _fine(plants, taken, scenario, t, y)
+    r, v = scenario.reference, scenario.of("v", plants.n_v)
+    return [
+        Run(
+            controller,
+            t,
+            y[i],
+            measured[i],
+            r,
+            moves.w[i],
+            u[i],
+            du[i],
+            v,
+            moves.status[i],
+            moves.cost[i],
+            moves.active[i],
+            moves.iterations[i],
+            t_fine,
+            y_fine[i],
+            Move(*(getattr(moves, name)[i] for name in Move.__dataclass_fields__))
+            if keep_moves
+            else None,
+        )
+        for i in range(plants.size)
+    ]
+
+
+def _fine(
+    plants: _Single | _Stacked,
+    taken: list[Sample],
+    scenario: Scenario,
+    t: Array,
+    y: Array,
+) -> tuple[Array, Array]:
+    """Time and output between the samples, the first sample included."""
+    if plants.times is None:
+        return t, y
+    inside = [s.between for s in taken if s.between is not None]
+    d_y = scenario.of("output_disturbance", y.shape[2])
+    blocks = np.stack(inside, axis=1) + d_y[:, None]
+    fine = blocks.reshape(plants.size, -1, y.shape[2])
+    t_fine = (t[:, None] + plants.times).ravel()
+    return np.concatenate([t[:1], t_fine]), np.concatenate([y[:, :1], fine], axis=1)
+
+
+def _check_sizes(plants: _Single | _Stacked, controller: Controller) -> None:
+    model = controller.model
+    if (plants.n_y, plants.n_u) != (model.n_y, model.n_u):
+        raise ValueError(
+            f"the plant has {plants.n_y} outputs and {plants.n_u} inputs, the "
+            f"controller's model {model.n_y} and {model.n_u}"
+        )
+    if model.n_v and plants.n_v != model.n_v:
+        raise ValueError(
+            f"the plant has {plants.n_v} measured disturbances, the controller's model "
+            f"{model.n_v}"
+        )
+    if not np.isclose(plants.dt, model.dt, rtol=1e-9):
+        raise ValueError(
+            f"the plant is sampled every {plants.dt} s, the controller's model every "
+            f"{model.dt} s"
+        )
+
+
+def _constant(value: Array | None, size: int) -> Array:
+    return np.zeros(size) if value is None else np.broadcast_to(value, (size,)) * 1.0
+
+
+def _padded(series: Array, ahead: int) -> Array:
+    return np.concatenate([series, np.repeat(series[-1:], ahead, axis=0)])
+
+
+def _series(name: str, value: Any, finite: bool = True) -> Array:
+    series = np.asarray(value, dtype=float)
+    if series.ndim == 1:
+        series = series[:, None]
+    if series.ndim != 2 or not len(series):
+        raise ValueError(f"{name} has shape {series.shape}, expected (N, channels)")
+    if finite and not np.isfinite(series).all():
+        k, i = np.argwhere(~np.isfinite(series))[0]
+        raise ValueError(f"{name} is not finite at sample {k}, channel {i}")
+    return series
+
+
