@@ -239,7 +239,7 @@ def test_fractional_dead_time_of_a_first_order_lag(delay):
 def test_dead_time_that_is_whole_but_for_rounding():
     """0.3 / 0.1 is not 3 in binary numbers, but three samples are meant."""
     plant = ContinuousPlant([[TransferFunction([1.0], [1.0, 1.0], 0.3)]])
-    assert plant.difference_model(0.1).nb == 4
+    assert plant.difference_model(0.1).dead_time.tolist() == [[4.0]]
     assert plant.sampled(0.1).n_x == 4
 
 
@@ -334,13 +334,16 @@ def test_every_delay_is_whole_leading_zeros(plant):
         ((poly(-3), poly(-1, -3), [1.0], poly(-3)), 2),
         (([1.0], poly(0.5, -1), [1.0], poly(0.5)), 2),
         (([1e-6], poly(-1, -2), [1e6], poly(-1.1)), 3),
+        (([1e-9], poly(-1, -2), [1e9], poly(-1.1), [1.0], poly(-1)), 3),
         (([1.0], poly(-1), [1.0], poly(-1.00001)), 2),
+        (([1.0], poly(-1), [1.0], poly(-1 - 1e-8)), 2),
         (([1.0], poly(-1, -1000), [1.0], poly(-1, -0.001)), 2),
     ],
     ids=[
         "double pole", "double and single", "triple and double", "integrators",
         "common factor", "common factor needed by another", "unstable",
-        "gains of 1e-6 and 1e6", "nearly equal poles", "a pole that fades at once",
+        "gains of 1e-6 and 1e6", "such gains and a shared pole", "nearly equal poles",
+        "poles a little further apart than rounding", "a pole that fades at once",
     ],
 )  # fmt: skip
 def test_order_is_the_least_common_multiple(row, order, rng):
@@ -417,6 +420,23 @@ def test_state_space_with_many_outputs(package, rng):
     for model in (difference_model(package(*MATRICES), 0.5), difference_model(same)):
         assert_close(model.simulate(u), expected, RECURSION)
         assert orders(model) == [2, 1]
+
+
+@pytest.mark.parametrize("continuous", [True, False])
+def test_units_do_not_change_orders(continuous):
+    """States, inputs and outputs in odd units hide no mode and show none."""
+    A = np.array([[-1.0, 0.5, 0.0], [0.0, -2.0, 0.0], [0.3, 0.4, -0.5]])
+    A = A if continuous else 0.2 * A
+    B, C = np.array([[1.0, 0.0], [1.0, 2.0], [0.0, 1.0]]), np.eye(2, 3)
+    D, x, u, y = np.zeros((2, 2)), np.diag([1e6, 1.0, 1e-6]), 1e-12, 1e-14
+    own = {} if continuous else {"dt": 0.5}
+    dt = 0.5 if continuous else None
+    plain = difference_model(scipy.signal.StateSpace(A, B, C, D, **own), dt)
+    odd = (x @ A @ np.linalg.inv(x), x @ B * u, C @ np.linalg.inv(x) * y, D)
+    model = difference_model(scipy.signal.StateSpace(*odd, **own), dt)
+    assert orders(plain) == [2, 1]
+    assert_close(model.a, plain.a, ALGEBRA)
+    assert_close(model.b / (u * y), plain.b, ALGEBRA)
 
 
 def test_matrix_of_transfer_functions():
