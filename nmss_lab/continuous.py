@@ -35,9 +35,9 @@ WHOLE = 1e-9
 # How sharply to look for common factors; the first reduction that passes is taken.
 REDUCTIONS = (1e-8, 1e-10, 1e-12)
 # A reduction passes if it changes no impulse response by more than this share of it.
-UNCHANGED = 1e-13
+UNCHANGED = 1e-12
 # Sums this small against their terms are rounding, and coefficients are set to zero.
-NEGLIGIBLE = 1e-15
+NEGLIGIBLE = 2e-15
 
 NO_FEEDTHROUGH = (
     "the difference equation (2.1) has no u_k on its right-hand side, "
@@ -501,9 +501,9 @@ def _equation(blocks: Sequence[_Sampled], n_w: int) -> _Equation:
     b = np.zeros((max((e.lag for *_, e in pairs), default=0) + max(n, 1), n_w))
     for A, c, effect in pairs:
         impulse = _impulse(A, effect.gain[:, None], c, n)[:, 0]
-        numerator = _without_rounding(
-            np.convolve(a, impulse)[:n], np.convolve(np.abs(a), np.abs(impulse))
-        )
+        terms = np.convolve(np.abs(a), np.abs(impulse))
+        terms += np.abs(c) @ np.abs(effect.gain)
+        numerator = _without_rounding(np.convolve(a, impulse)[:n], terms)
         b[effect.lag : effect.lag + n, effect.column] += numerator
     return _Equation(_without_rounding(a, a)[1:], b)
 
@@ -520,7 +520,7 @@ def _denominator(blocks: Sequence[_Sampled]) -> Array:
     impulse = _impulse(A, B, c, 2 * len(full))
     for tolerance in REDUCTIONS:
         a = _characteristic(_essential(A, B, c, tolerance))
-        if _annihilates(a, impulse):
+        if _annihilates(a, impulse, np.abs(c) @ np.abs(B)):
             return a
     return full
 
@@ -561,13 +561,18 @@ def _impulse(A: Array, B: Array, c: Array, count: int) -> Array:
     return values
 
 
-def _annihilates(a: Array, impulse: Array) -> bool:
-    """Whether every impulse response obeys the recursion a from its start on."""
+def _annihilates(a: Array, impulse: Array, terms: Array) -> bool:
+    """Whether every impulse response obeys the recursion a from its start on.
+
+    ``terms`` (m,) is the size of the terms of which each response is a sum: a response
+    that is only their rounding is zero.
+    """
     n = len(a) - 1
-    for response in impulse.T:
+    for response, size in zip(impulse.T, terms, strict=True):
         rest = np.convolve(a, response)[n : len(response)]
         scale = np.convolve(np.abs(a), np.abs(response)).max()
-        if np.abs(rest).max(initial=0.0) > UNCHANGED * scale:
+        allowed = max(UNCHANGED * scale, NEGLIGIBLE * size * np.abs(a).sum())
+        if np.abs(rest).max(initial=0.0) > allowed:
             return False
     return True
 

@@ -439,6 +439,23 @@ def test_units_do_not_change_orders(continuous):
     assert_close(model.b / (u * y), plain.b, ALGEBRA)
 
 
+@pytest.mark.parametrize("seed", range(20))
+def test_rotated_states_hide_nothing(seed):
+    """Modes that an output does not see stay unseen when all matrices are full."""
+    rng = np.random.default_rng(seed)
+    A = -np.diag(rng.uniform(0.05, 1.0, 4))
+    A[0, 2], A[1, 3] = 0.3, 0.5
+    B = np.array([[1.0, 0, 0], [0, 1, 0], [0, 0.4, 0], [0.5, 0, 0]])
+    C, D = np.eye(4)[[0, 1, 3]], np.zeros((3, 3))
+    Q, _ = np.linalg.qr(rng.normal(size=(4, 4)))
+    plain = difference_model(scipy.signal.StateSpace(A, B, C, D), 1.0)
+    turned = scipy.signal.StateSpace(Q @ A @ Q.T, Q @ B, C @ Q.T, D)
+    model = difference_model(turned, 1.0)
+    assert orders(model) == orders(plain) == [2, 2, 1]
+    assert np.array_equal(model.dead_time, plain.dead_time)
+    assert_close(model.b, plain.b, ALGEBRA)
+
+
 def test_matrix_of_transfer_functions():
     """Python-control's tables of num and den: each row gets its common multiple."""
     num = [[[1.0], [2.0]], [[1.0, 0.0], [3.0]]]
