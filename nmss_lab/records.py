@@ -278,12 +278,7 @@ class Record:
             If a column is missing or named twice, or if a cell is not a finite number:
             the message gives the row of the file (the header is row 1) and the column.
         """
-        if (time is None) == (dt is None):
-            raise ValueError("give either time (a column name) or dt (an interval)")
-        if not y or isinstance(y, str):
-            raise ValueError(f"y is {y!r}; expected a list of column names")
-        if dt is not None and not (np.isfinite(dt) and dt > 0):
-            raise ValueError(f"dt is {dt}; expected a positive number")
+        _check_choice(y, time, dt)
         groups = {"y": y, "u": u, "v": v, "r": r}
         wanted = [name for group in groups.values() for name in group]
         wanted += [time] if time is not None else []
@@ -357,6 +352,16 @@ _TRENDS: dict[str, Callable[[Array, Array], Array]] = {
     "linear": _line,
     "first": lambda _, signal: signal[:1],
 }
+
+
+def _check_choice(y: Sequence[str], time: str | None, dt: float | None) -> None:
+    """Check what `Record.from_csv` is asked to read."""
+    if (time is None) == (dt is None):
+        raise ValueError("give either time (a column name) or dt (an interval)")
+    if not y or isinstance(y, str):
+        raise ValueError(f"y is {y!r}; expected a list of column names")
+    if dt is not None and not (np.isfinite(dt) and dt > 0):
+        raise ValueError(f"dt is {dt}; expected a positive number")
 
 
 @contextmanager
