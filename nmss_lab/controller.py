@@ -250,6 +250,11 @@ class Controller(ABC):
         """How many samples of v beyond v_k ``decide`` reads."""
         return 0
 
+    @property
+    def governs_ahead(self) -> int:
+        """Samples between a decision and the reference that ``Move.governed`` is."""
+        return 0
+
     @cached_property
     def limits_u(self) -> tuple[Array, Array]:
         """Level limits (n_u,) each."""
@@ -333,7 +338,9 @@ class Controller(ABC):
             y = np.where(np.isfinite(y), y, before @ recipe.forecast.T)
             v = np.where(np.isfinite(v), v, layout.read(before, "v")[..., 0, :])
         r = np.broadcast_to(r, y.shape)
-        now = np.concatenate([y, np.broadcast_to(v, (*y.shape[:-1], v.shape[-1])), r], -1)
+        now = np.concatenate(
+            [y, np.broadcast_to(v, (*y.shape[:-1], v.shape[-1])), r], -1
+        )
         vector = before @ recipe.carry.T + now @ recipe.enter.T
         if "integral" in layout and not good.all():
             kept = before[..., layout["integral"]]
@@ -475,7 +482,7 @@ def _ahead(name: str, given: Array | None, now: Array, steps: int) -> Array:
         values = values[None]
     if values.shape[-2] < steps or values.shape[-1] != channels:
         raise ValueError(
-            f"{name} has shape {values.shape}, expected (..., {steps}, {channels}): the "
+            f"{name} has shape {values.shape}, expected (.., {steps}, {channels}): the "
             f"present value and {steps - 1} samples ahead"
         )
     if not np.isfinite(values).all():

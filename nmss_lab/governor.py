@@ -55,6 +55,11 @@ class ReferenceGovernor(PredictiveController):
         law = self.first_move.known
         return law @ knows.from_memory, law @ knows.from_r
 
+    @property
+    def governs_ahead(self) -> int:
+        """0 when w_k is chosen at k, 1 when w_{k+1} is."""
+        return int(not self.causal)
+
     def _finish(self, move: Move, memory: Memory) -> Move:
         w = self.plan(move, "w")[:, 0]
         move = super()._finish(move, memory)
@@ -152,7 +157,7 @@ def governor(
 
 
 def _reference(known: Layout, horizon: Horizon, causal: bool, beta: Affine) -> Affine:
-    """r at each step of the horizon, Np n_y rows."""
+    """Return r at each step of the horizon, Np n_y rows."""
     part = known_part(known, "r", beta.gain.shape[1])
     return stack([part] * horizon.Np) if causal else part
 

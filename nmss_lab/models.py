@@ -14,7 +14,8 @@ from typing import Any, Protocol
 import numpy as np
 import scipy.linalg
 
-Array = np.ndarray[Any, np.dtype[np.float64]]
+Array = np.ndarray[Any, np.dtype[Any]]
+"""Array of numbers; float64 unless a docstring says otherwise."""
 
 
 class Plant(Protocol):
@@ -26,16 +27,29 @@ class Plant(Protocol):
     """
 
     @property
-    def n_y(self) -> int: ...
+    def n_y(self) -> int:
+        """Number of outputs."""
+
     @property
-    def n_u(self) -> int: ...
+    def n_u(self) -> int:
+        """Number of inputs."""
+
     @property
-    def n_v(self) -> int: ...
+    def n_v(self) -> int:
+        """Number of measured disturbances."""
+
     @property
-    def dt(self) -> float: ...
-    def reset(self, u0: Array, v0: Array, y0: Array | None = None) -> Any: ...
-    def output(self, state: Any) -> Array: ...
-    def step(self, state: Any, u: Array, v: Array) -> Any: ...
+    def dt(self) -> float:
+        """Sampling interval in seconds."""
+
+    def reset(self, u0: Array, v0: Array, y0: Array | None = None) -> Any:
+        """State at rest for constant inputs, disturbances and, perhaps, outputs."""
+
+    def output(self, state: Any) -> Array:
+        """Return the outputs y_k (n_y,)."""
+
+    def step(self, state: Any, u: Array, v: Array) -> Any:
+        """State one sample later."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,9 +69,9 @@ class Between:
 
 @dataclass(frozen=True, eq=False)
 class LinearPlant:
-    """A linear plant in discrete time, without feedthrough.
+    r"""A linear plant in discrete time, without feedthrough.
 
-    .. math:: x_{k+1} = A x_k + B u_k + G v_k, \\qquad y_k = C x_k
+    .. math:: x_{k+1} = A x_k + B u_k + G v_k, \qquad y_k = C x_k
 
     Parameters
     ----------
@@ -76,7 +90,7 @@ class LinearPlant:
     A: Array
     B: Array
     C: Array
-    G: Array | None = None
+    G: Array = None  # type: ignore[assignment]  # zero columns once built
     dt: float = 1.0
     between: Between | None = None
     rest: Array | None = None
@@ -104,12 +118,7 @@ class LinearPlant:
     @property
     def n_v(self) -> int:
         """Number of measured disturbances."""
-        return self._G.shape[1]
-
-    @property
-    def _G(self) -> Array:
-        assert self.G is not None  # set in __post_init__
-        return self.G
+        return self.G.shape[1]
 
     def reset(self, u0: Array, v0: Array, y0: Array | None = None) -> Array:
         """State at rest for constant inputs ``u0`` (n_u,) and disturbances ``v0``.
@@ -122,7 +131,7 @@ class LinearPlant:
         ValueError
             If the plant integrates and has no equilibrium for these inputs.
         """
-        drive = self.B @ u0 + self._G @ v0
+        drive = self.B @ u0 + self.G @ v0
         if y0 is None or self.rest is None:
             state, *_ = np.linalg.lstsq(np.eye(self.n_x) - self.A, drive, rcond=None)
             drift = np.abs(self.A @ state + drive - state).max(initial=0.0)
@@ -136,13 +145,13 @@ class LinearPlant:
         return rest
 
     def output(self, state: Array) -> Array:
-        """Outputs y_k (n_y,) of a state; an ensemble of states works too."""
+        """Return the outputs y_k (n_y,) of a state; an ensemble of states works too."""
         y: Array = state @ self.C.T
         return y
 
     def step(self, state: Array, u: Array, v: Array) -> Array:
         """State one sample later, with ``u`` and ``v`` held."""
-        following: Array = self.A @ state + self.B @ u + self._G @ v
+        following: Array = self.A @ state + self.B @ u + self.G @ v
         return following
 
     def poles(self) -> Array:
@@ -192,7 +201,7 @@ class DifferenceModel:
 
     a: Array
     b: Array
-    g: Array | None = None
+    g: Array = None  # type: ignore[assignment]  # no entries once built
     dt: float = 1.0
     y_names: Sequence[str] = ()
     u_names: Sequence[str] = ()
@@ -236,7 +245,7 @@ class DifferenceModel:
     @property
     def ng(self) -> int:
         """Number of past measured disturbances, the thesis's l."""
-        return self._g.shape[0]
+        return self.g.shape[0]
 
     @property
     def n_y(self) -> int:
@@ -251,12 +260,7 @@ class DifferenceModel:
     @property
     def n_v(self) -> int:
         """Number of measured disturbances, the thesis's r."""
-        return self._g.shape[2]
-
-    @property
-    def _g(self) -> Array:
-        assert self.g is not None  # set in __post_init__
-        return self.g
+        return self.g.shape[2]
 
     @property
     def dead_time(self) -> Array:
@@ -272,7 +276,7 @@ class DifferenceModel:
         """Roots of det A(z), the largest first, (na n_y,)."""
         n = self.na * self.n_y
         companion = np.eye(n, k=-self.n_y)
-        companion[: self.n_y] = -np.hstack(self.a)
+        companion[: self.n_y] = -np.hstack(list(self.a))
         return sort_by_size(np.linalg.eigvals(companion))
 
     def zeros(self) -> Array:
@@ -293,7 +297,7 @@ class DifferenceModel:
         pencil = np.block([[A, B], [C, np.zeros((p, p))]])
         mass = scipy.linalg.block_diag(np.eye(n), np.zeros((p, p)))
         found = scipy.linalg.eigvals(pencil, mass, homogeneous_eigvals=True)
-        finite = np.abs(found[1]) > 1e-9 * np.abs(found).max()
+        finite = np.abs(found[1]) > 1e-6 * np.abs(found[0])
         return sort_by_size(found[0][finite] / found[1][finite])
 
     def steady_state_gain(self) -> Array:
@@ -302,7 +306,7 @@ class DifferenceModel:
 
     def disturbance_gain(self) -> Array:
         """Gain A(1)^-1 G(1) from measured disturbances, (n_y, n_v)."""
-        return self._gain(self._g)
+        return self._gain(self.g)
 
     def _gain(self, numerator: Array) -> Array:
         a1 = np.eye(self.n_y) + self.a.sum(axis=0)
@@ -313,7 +317,9 @@ class DifferenceModel:
 
     def response(self, z: complex) -> Array:
         """Transfer matrix A(z)^-1 B(z) at ``z``, complex (n_y, n_u)."""
-        a = np.eye(self.n_y) + np.tensordot(z ** -np.arange(1.0, self.na + 1), self.a, 1)
+        a = np.eye(self.n_y) + np.tensordot(
+            z ** -np.arange(1.0, self.na + 1), self.a, 1
+        )
         b = np.tensordot(z ** -np.arange(1.0, self.nb + 1), self.b, 1)
         at_z: Array = np.linalg.solve(a, b)
         return at_z
@@ -321,7 +327,7 @@ class DifferenceModel:
     def simulate(
         self, u: Array, v: Array | None = None, y0: Array | None = None
     ) -> Array:
-        """Outputs y (N, n_y) for inputs u (N, n_u) and disturbances v (N, n_v).
+        """Compute outputs y (N, n_y) for inputs u (N, n_u) and disturbances v (N, n_v).
 
         ``y[k]`` does not depend on ``u[k]``: the equation has one sample of delay.
         Before the first sample, u and v are zero and y is ``y0`` (zero by default).
@@ -341,7 +347,7 @@ class DifferenceModel:
         self, numerator: float = 1.0, denominator: float = 1.0
     ) -> DifferenceModel:
         """Model with b (and g) and a multiplied by factors, as in (6.11)."""
-        g = self.g if self.ng == 0 else self._g * numerator
+        g = self.g * numerator
         return dataclasses.replace(
             self, a=self.a * denominator, b=self.b * numerator, g=g
         )
@@ -358,7 +364,7 @@ class DifferenceModel:
         def pad(c: Array) -> Array:
             return np.concatenate([c, np.zeros((self._depth() - len(c), *c.shape[1:]))])
 
-        return pad(self.a), pad(self.b), pad(self._g)
+        return pad(self.a), pad(self.b), pad(self.g)
 
     def _canonical(self) -> tuple[Array, Array, Array, Array]:
         a, b, g = self._padded()
@@ -383,7 +389,7 @@ class DifferenceModel:
 
 
 def minimal_realisation(A: Array, B: Array, C: Array) -> tuple[Array, Array, Array]:
-    """Controllable and observable part of (A, B, C), by orthogonal projection."""
+    """Find the controllable and observable part of (A, B, C) by projection."""
     V = reachable_basis(A, B)
     A, B, C = V.T @ A @ V, V.T @ B, C @ V
     W = reachable_basis(A.T, C.T)

@@ -127,6 +127,16 @@ class PredictiveController(Controller):
         free: Array = self.first_move.gain @ self.program.free + self.first_move.known
         return free
 
+    def gain(self, name: str) -> Array:
+        """Gain of the law u_k = ... - gain @ part, for a part of the known vector.
+
+        ``gain("x")`` is the first block row of K_s and ``gain("r")`` that of R_s in
+        (4.17); for structures on changes the law adds u_{k-1} and ``-gain("r")`` is
+        w_s of (6.3).
+        """
+        part: Array = -self.free_gain[:, self.knowledge.layout[name]]
+        return part
+
     def free_law(self) -> tuple[Array, Array]:
         """First move without limits: gains on the memory and on r_k, r_{k+1}, ..."""
         knows = self.knowledge
@@ -163,7 +173,7 @@ class PredictiveController(Controller):
             iterations=np.zeros(loops, dtype=int),
             shift=np.zeros(loops, dtype=int),
         )
-        for i in np.flatnonzero(~kept | memory.refused):
+        for i in np.flatnonzero(~kept | memory.refused).tolist():
             self._decide_limited(move, memory, i)
         return self._finish(move, memory)
 
@@ -699,7 +709,7 @@ class _Setup:
         )
 
     def _rest(self, Y: Affine, dU: Affine) -> Limit:
-        """Equality rows of (C.2.1): na + 1 outputs at r, nb - 1 inputs without change."""
+        """Rows of (C.2.1): na + 1 outputs at r, nb - 1 changes of inputs at zero."""
         model, Np = self.model, self.horizon.Np
         outputs = min(model.na + 1, Np) * model.n_y
         inputs = min(model.nb - 1, Np) * model.n_u
@@ -736,13 +746,16 @@ class _Setup:
         return Knowledge(known, from_memory, from_r, from_v)
 
 
-def limit(
-    name: str, signal: Affine, sides: tuple[Array, Array], steps: Array
-) -> Limit:
+def limit(name: str, signal: Affine, sides: tuple[Array, Array], steps: Array) -> Limit:
     """Limit with the same sides (n,) at each of the steps."""
     low, high = sides
     return Limit(
-        name, signal, np.tile(low, len(steps)), np.tile(high, len(steps)), len(low), steps
+        name,
+        signal,
+        np.tile(low, len(steps)),
+        np.tile(high, len(steps)),
+        len(low),
+        steps,
     )
 
 

@@ -179,7 +179,7 @@ def integral_of_error_form(model: DifferenceModel, governed: bool = False) -> Fo
     A = np.block([[plain["A"], np.zeros((n, p))], [-plain["A"][:p], np.eye(p)]])
     B = np.vstack([plain["B"], -plain["B"][:p]])
     D = np.eye(n + p, p, k=-n)
-    layout = _layout(model, integral=p, **({"w": p} if governed else {}))
+    layout = _layout(model, integral=p, w=p if governed else 0)
     rows = [_rows(layout, "y", model.na), _rows(layout, "u", model.nb - 1)]
     state = np.vstack([*rows, layout.select("integral")])
     names = (*names, *(f"sum of error in {y}" for y in model.y_names))
@@ -214,7 +214,7 @@ def differenced_form(
     G = np.zeros((A.shape[0], 0))
     if disturbances == "direct":
         G, lags = np.zeros((A.shape[0], model.ng * model.n_v)), tuple(range(model.ng))
-        G[:p] = _side_by_side(model._g)
+        G[:p] = _side_by_side(model.g)
     if disturbances == "augmented":
         A, B, G, names = _augment(model, A, B, names)
         lags = (-1,)
@@ -339,7 +339,7 @@ def _kalman(A: Array, B: Array, C: Array, q: float, r: float) -> Array:
 
 
 def _past(model: DifferenceModel) -> tuple[dict[str, Array], tuple[str, ...]]:
-    """A and B of (4.3): past outputs and inputs move down by one sample."""
+    """Build A and B of (4.3): past outputs and inputs move down by one sample."""
     p, q, na, nb = model.n_y, model.n_u, model.na, model.nb
     n_past_y, n_past_u = na * p, (nb - 1) * q
     A = np.zeros((n_past_y + n_past_u,) * 2)
@@ -363,7 +363,7 @@ def _augment(
     n, width, r = A.shape[0], model.ng * model.n_v, model.n_v
     wide = np.zeros((n + width, n + width))
     wide[:n, :n] = A
-    wide[: model.n_y, n:] = _side_by_side(model._g)
+    wide[: model.n_y, n:] = _side_by_side(model.g)
     wide[n:, n:] = np.eye(width, k=-r)
     G = np.eye(n + width, r, k=-n)
     added = [f"change of {v}[{_at(i)}]" for i in range(model.ng) for v in model.v_names]
@@ -381,7 +381,7 @@ def _layout(model: DifferenceModel, internal: bool = False, **more: int) -> Layo
     if internal:
         shapes["y_model"] = (model.na + 1, model.n_y)
         shapes["u_model"] = (model.nb, model.n_u)
-    return Layout(**shapes, **more)
+    return Layout(**shapes, **{name: size for name, size in more.items() if size})
 
 
 def _recipe(
@@ -389,7 +389,10 @@ def _recipe(
 ) -> Recipe:
     p, q, r = model.n_y, model.n_u, model.n_v
     carry, keep = np.eye(layout.size), np.eye(layout.size)
-    enter, store = np.zeros((layout.size, 2 * p + r)), np.zeros((layout.size, 2 * q + p))
+    enter, store = (
+        np.zeros((layout.size, 2 * p + r)),
+        np.zeros((layout.size, 2 * q + p)),
+    )
     _push(layout, "y", carry, enter, slice(0, p))
     _push(layout, "v", carry, enter, slice(p, p + r))
     _push(layout, "r", carry, enter, slice(p + r, None))
@@ -424,7 +427,7 @@ def _push(
 def _one_step(model: DifferenceModel, layout: Layout, y: str, u: str) -> Array:
     """y_k predicted by (2.1) from histories that end at sample k - 1."""
     row = np.zeros((model.n_y, layout.size))
-    for name, coefficients in ((y, -model.a), (u, model.b), ("v", model._g)):
+    for name, coefficients in ((y, -model.a), (u, model.b), ("v", model.g)):
         start = layout[name].start
         stacked = _side_by_side(coefficients)
         row[:, start : start + stacked.shape[1]] = stacked

@@ -43,9 +43,7 @@ class StateFeedback(Controller):
     def _decide(self, memory: Memory, r: Array, v: Array) -> Move:
         on_memory, _ = self.free_law()
         before = self.last_input(memory.vector)
-        wanted = np.where(
-            memory.refused[:, None], before, memory.vector @ on_memory.T
-        )
+        wanted = np.where(memory.refused[:, None], before, memory.vector @ on_memory.T)
         u = self.clip(wanted, before)
         loops = len(u)
         cut = np.abs(u - wanted).max(axis=-1) > 1e-9
@@ -228,8 +226,8 @@ def gain(name: str, value: Any, form: Form) -> Array:
     K = np.atleast_2d(np.asarray(value, dtype=float))
     if K.shape != (form.n_u, form.n_x):
         raise ValueError(
-            f"{name} has shape {K.shape}, expected ({form.n_u}, {form.n_x}): one row an "
-            "input, one column a state"
+            f"{name} has shape {K.shape}, expected ({form.n_u}, {form.n_x}): a row an "
+            "input, a column a state"
         )
     if not np.isfinite(K).all():
         raise ValueError(f"{name} holds entries that are not finite")

@@ -54,11 +54,11 @@ class Affine:
         return Affine(matrix @ self.gain, matrix @ self.known)
 
     def __getitem__(self, rows: slice | Array | list[int]) -> Affine:
-        """Some rows of the signal."""
+        """Return some rows of the signal."""
         return Affine(self.gain[rows], self.known[rows])
 
     def __len__(self) -> int:
-        """Number of rows."""
+        """Return the number of rows."""
         return self.gain.shape[0]
 
     def value(self, z: Array, theta: Array) -> Array:

@@ -174,9 +174,9 @@ def assemble(
         If the condensed H is not positive definite, with its smallest eigenvalue.
         Indefinite blocks are fine as long as H is not.
     """
-    H = _symmetric(sum(c.signal.gain.T @ c.weight @ c.signal.gain for c in costs))
-    f = sum(c.signal.gain.T @ c.weight @ c.signal.known for c in costs)
-    constant = sum(c.signal.known.T @ c.weight @ c.signal.known for c in costs)
+    table = sum_of_squares(costs)
+    n_z = costs[0].signal.gain.shape[1]
+    H, f, constant = table[:n_z, :n_z], table[:n_z, n_z:], table[n_z:, n_z:]
     smallest, largest = np.linalg.eigvalsh(H)[[0, -1]]
     if not smallest > 1e-13 * abs(largest):
         raise ValueError(
@@ -186,8 +186,10 @@ def assemble(
         )
     rows = [_rows(limit) for limit in limits]
     parts = [part for part, _, _ in rows] or [np.zeros((0, H.shape[0] + f.shape[1]))]
-    table = np.concatenate(parts)
-    M, offset, bounds = np.split(table, [H.shape[0], H.shape[0] + f.shape[1]], axis=1)
+    rows_table = np.concatenate(parts)
+    M, offset, bounds = np.split(
+        rows_table, [H.shape[0], H.shape[0] + f.shape[1]], axis=1
+    )
     if not limits:
         bounds = np.zeros((0, 2))
     labels = tuple(label for _, kept, _ in rows for label in kept)
@@ -198,15 +200,21 @@ def assemble(
     )
 
 
-def _symmetric(matrix: Array) -> Array:
-    symmetric: Array = (matrix + matrix.T) / 2.0
-    return symmetric
+def sum_of_squares(costs: Sequence[Cost]) -> Array:
+    """Sum of all costs as one symmetric matrix on [z; theta]."""
+    total: Array = np.zeros(())
+    for cost in costs:
+        both = np.hstack([cost.signal.gain, cost.signal.known])
+        total = total + both.T @ cost.weight @ both
+    return (total + total.T) / 2.0
 
 
 def _rows(limit: Limit) -> tuple[Array, list[Row], list[Row]]:
     """Rows [gain, known, lower, upper] that matter, their labels, and those left out."""
     labels = [
-        Row(limit.name, i, int(step)) for step in limit.steps for i in range(limit.channels)
+        Row(limit.name, i, int(step))
+        for step in limit.steps
+        for i in range(limit.channels)
     ]
     bounded = np.isfinite(limit.lower) | np.isfinite(limit.upper)
     size = np.abs(limit.signal.gain).max(axis=1, initial=0.0)
@@ -310,7 +318,9 @@ def solve(
     solver = find_backend(backend)
     low, high = bounds or (program.lower, program.upper)
     known = program.offset @ theta
-    problem = Problem(program.H, program.f @ theta, program.M, low - known, high - known)
+    problem = Problem(
+        program.H, program.f @ theta, program.M, low - known, high - known
+    )
     nothing = np.zeros(program.n_z), np.zeros(len(known))
     try:
         z, multipliers, iterations, infeasible = solver(problem)
@@ -319,7 +329,9 @@ def solve(
     if infeasible:
         return Solution(*nothing, QPStatus.INFEASIBLE, iterations)
     if z is None or not np.isfinite(z).all() or not np.isfinite(multipliers).all():
-        return Solution(*nothing, QPStatus.FAILED, iterations, message=f"{backend} gave no numbers")
+        return Solution(
+            *nothing, QPStatus.FAILED, iterations, message=f"{backend} gave no numbers"
+        )
     z, multipliers, residual = _polish(problem, z, multipliers)
     good = residual <= ACCEPTED
     status = QPStatus.SOLVED if good else QPStatus.INACCURATE
@@ -334,7 +346,9 @@ def kkt_residual(problem: Problem, z: Array, multipliers: Array) -> float:
     """
     Hz, value = problem.H @ z, problem.M @ z
     push = problem.M.T @ multipliers
-    terms = max(np.abs(Hz).max(), np.abs(problem.f).max(), np.abs(push).max(initial=0.0))
+    terms = max(
+        np.abs(Hz).max(), np.abs(problem.f).max(), np.abs(push).max(initial=0.0)
+    )
     stationarity = np.abs(Hz + problem.f + push).max() / (1.0 + terms)
     below, above = problem.lower - value, value - problem.upper
     nearest = np.minimum(np.abs(problem.lower), np.abs(problem.upper))
@@ -345,7 +359,9 @@ def kkt_residual(problem: Problem, z: Array, multipliers: Array) -> float:
     return float(max(stationarity, broken.max(initial=0.0), complementarity))
 
 
-def _polish(problem: Problem, z: Array, multipliers: Array) -> tuple[Array, Array, float]:
+def _polish(
+    problem: Problem, z: Array, multipliers: Array
+) -> tuple[Array, Array, float]:
     """Solve the equations of the active rows exactly, if that is the better answer."""
     largest = np.abs(multipliers).max(initial=0.0)
     held = np.abs(multipliers) > 1e-9 * (1.0 + largest)

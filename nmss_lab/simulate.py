@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -72,7 +72,7 @@ class Scenario:
             object.__setattr__(self, name, series)
 
     def __len__(self) -> int:
-        """Number of samples."""
+        """Return the number of samples."""
         return len(self.reference)
 
     def of(self, name: str, channels: int) -> Array:
@@ -139,7 +139,7 @@ class Run:
     moves: Move | None = None
 
     def __len__(self) -> int:
-        """Number of samples."""
+        """Return the number of samples."""
         return len(self.t)
 
     def trail(self, name: str) -> Array:
@@ -263,7 +263,12 @@ class _Single:
 
     def __init__(self, plant: Plant) -> None:
         self.plant, self.size = plant, 1
-        self.dt, self.n_y, self.n_u, self.n_v = plant.dt, plant.n_y, plant.n_u, plant.n_v
+        self.dt, self.n_y, self.n_u, self.n_v = (
+            plant.dt,
+            plant.n_y,
+            plant.n_u,
+            plant.n_v,
+        )
         self.times = _times(plant)
 
     def reset(self, u0: Array, v0: Array, y0: Array | None) -> Any:
@@ -276,7 +281,7 @@ class _Single:
         return self.plant.step(state, u[0], v[0])
 
     def between(self, state: Any, u: Array, v: Array) -> Array | None:
-        """Outputs (1, m, n_y) between this sample and the next."""
+        """Return outputs (1, m, n_y) between this sample and the next."""
         if self.times is None:
             return None
         part = self.plant.between  # type: ignore[attr-defined]
@@ -292,7 +297,12 @@ class _Stacked:
             raise ValueError("plants is empty, expected at least one LinearPlant")
         first = plants[0]
         self.plants, self.size = list(plants), len(plants)
-        self.dt, self.n_y, self.n_u, self.n_v = first.dt, first.n_y, first.n_u, first.n_v
+        self.dt, self.n_y, self.n_u, self.n_v = (
+            first.dt,
+            first.n_y,
+            first.n_u,
+            first.n_v,
+        )
         shapes = {(p.A.shape, p.B.shape, p.C.shape, p.dt) for p in plants}
         if len(shapes) > 1:
             raise ValueError(f"plants differ in size or dt: {sorted(map(str, shapes))}")
@@ -316,7 +326,7 @@ class _Stacked:
         return _each(self.A, state) + _each(self.B, u) + _each(self.G, v)
 
     def between(self, state: Array, u: Array, v: Array) -> Array | None:
-        """Outputs (loops, m, n_y) between this sample and the next."""
+        """Return outputs (loops, m, n_y) between this sample and the next."""
         if self.times is None:
             return None
         inside: Array = (
@@ -488,5 +498,3 @@ def _series(name: str, value: Any, finite: bool = True) -> Array:
         k, i = np.argwhere(~np.isfinite(series))[0]
         raise ValueError(f"{name} is not finite at sample {k}, channel {i}")
     return series
-
-

@@ -1,0 +1,426 @@
+r"""Analysis of the loop without active limits: poles, T, S_i, S_o, and a review.
+
+Memory, law and plant are linear, so the whole loop is one linear system, built from
+the same matrices that the simulation runs:
+
+.. math:: \xi_{k+1} = A \xi_k + \sum_i B_r^{(i)} r_{k+i} + B_u d_{u,k} + B_y d_{y,k},
+          \qquad y_k = C \xi_k + d_{y,k}
+
+with the plant's state and the controller's memory in :math:`\xi`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+
+from nmss_lab.controller import Controller
+from nmss_lab.models import (
+    Array,
+    DifferenceModel,
+    LinearPlant,
+    minimal_realisation,
+    sort_by_size,
+)
+from nmss_lab.mpc import PredictiveController
+
+Transfer = Literal["T", "S_i", "S_o"]
+
+ROUNDING = 1e-8
+"""A pole this close to the unit circle counts as on it."""
+
+
+@dataclass(frozen=True, eq=False)
+class LinearLoop:
+    """A closed loop without active limits, as one linear system.
+
+    Build it with ``linear_loop``.
+
+    Parameters
+    ----------
+    A, C : arrays (n, n), (n_y, n)
+    B_r : array (1 + preview, n, n_y)
+        Effect of r_k, r_{k+1}, ...
+    B_u, B_y : arrays (n, n_u), (n, n_y)
+        Effect of disturbances at the plant's input and output.
+    dt : float
+    """
+
+    A: Array
+    C: Array
+    B_r: Array
+    B_u: Array
+    B_y: Array
+    dt: float
+
+    @cached_property
+    def poles(self) -> Array:
+        """All poles, the largest first; histories add poles at the origin."""
+        return sort_by_size(np.linalg.eigvals(self.A))
+
+    @property
+    def radius(self) -> float:
+        """Modulus of the largest pole."""
+        return float(np.abs(self.poles[0]))
+
+    @property
+    def is_stable(self) -> bool:
+        """Whether all poles lie inside the unit circle, by more than rounding."""
+        return self.radius < 1.0 - ROUNDING
+
+    @cached_property
+    def hidden_modes(self) -> Array:
+        """Poles which the response to the reference does not show, 0.05 off the origin.
+
+        The forward path keeps every open-loop pole of its model as a hidden mode: they
+        cancel in T(z) when the model is exact, and come to light with a disturbance.
+        """
+        B = np.hstack(list(self.B_r))
+        left = list(self.poles)
+        for pole in np.linalg.eigvals(minimal_realisation(self.A, B, self.C)[0]):
+            left.pop(int(np.argmin(np.abs(np.array(left) - pole))))
+        hidden = np.array(left)
+        # Histories put many poles at the origin, which rounding spreads by up to 0.02.
+        return hidden[np.abs(hidden) > 0.05]
+
+    def transfer(self, which: Transfer, z: complex) -> Array:
+        """Transfer matrix at ``z``: "T" from r, "S_i" from d_u, "S_o" from d_y to y.
+
+        (4.18), (4.20), (4.21) and (6.5)-(6.7) for every structure.  A pole at ``z``
+        that cancels is left out; one that does not gives infinite entries.
+        """
+        B = self._input(which, z)
+        direct = np.eye(len(self.C)) if which == "S_o" else 0.0
+        at_z = _evaluate(self.A, B, self.C, z) + direct
+        return at_z.real if np.isreal(z) else at_z
+
+    def frequency_response(self, which: Transfer, omega: Array) -> Array:
+        """Transfer matrices (len(omega), n_y, .) at angular frequencies in rad/s."""
+        points = np.exp(1j * np.asarray(omega) * self.dt)
+        return np.stack([self.transfer(which, z) for z in points])
+
+    def _input(self, which: Transfer, z: complex) -> Array:
+        if which == "S_i":
+            return self.B_u
+        if which == "S_o":
+            return self.B_y
+        if which != "T":
+            raise ValueError(f'which = "{which}": expected "T", "S_i" or "S_o"')
+        ahead = z ** np.arange(len(self.B_r))
+        return np.tensordot(ahead, self.B_r, axes=1)
+
+
+def _evaluate(A: Array, B: Array, C: Array, z: complex) -> Array:
+    pencil = z * np.eye(len(A)) - A
+    if np.linalg.cond(pencil) < 1e11:
+        at_z: Array = C @ np.linalg.solve(pencil, B)
+        return at_z
+    columns = B.shape[1]
+    real = np.hstack([B.real, B.imag]) if np.iscomplexobj(B) else B
+    A, B, C = minimal_realisation(A, real, C)
+    B = B[:, :columns] + 1j * B[:, columns:] if B.shape[1] > columns else B
+    pencil = z * np.eye(len(A)) - A
+    if len(A) and np.linalg.cond(pencil) >= 1e11:
+        return np.full((len(C), columns), np.inf)
+    return np.asarray(C @ np.linalg.solve(pencil, B))
+
+
+def linear_loop(
+    controller: Controller,
+    plant: LinearPlant | DifferenceModel | None = None,
+    seen: bool = False,
+) -> LinearLoop:
+    """Close the loop around a plant, with no limit active.
+
+    Parameters
+    ----------
+    controller : Controller
+    plant : LinearPlant or DifferenceModel, optional
+        The controller's own model if absent.
+    seen : bool
+        Whether a disturbance at the plant's input also drives the internal model of a
+        forward path: printed (6.6) needs it, a real disturbance seldom does.
+
+    Raises
+    ------
+    ValueError
+        If the plant's size differs from the model's.
+    """
+    model = controller.model
+    plant = model if plant is None else plant
+    plant = plant.plant() if isinstance(plant, DifferenceModel) else plant
+    if (plant.n_y, plant.n_u) != (model.n_y, model.n_u):
+        raise ValueError(
+            f"the plant has {plant.n_y} outputs and {plant.n_u} inputs, the "
+            f"controller's model {model.n_y} and {model.n_u}"
+        )
+    p, q, n_x = model.n_y, model.n_u, plant.n_x
+    recipe = controller.form.recipe
+    law, on_r = controller.free_law()
+    enter_y, enter_r = recipe.enter[:, :p], recipe.enter[:, -p:]
+    store_u, store_seen = recipe.store[:, :q], recipe.store[:, q : 2 * q]
+    store_both, governed = store_u + store_seen, recipe.store[:, 2 * q :]
+    # What happens after measuring, in terms of the memory m+ and the move u:
+    # m <- keep m+ + store_both u,  x <- A x + B u.
+    after = np.vstack([plant.B @ law, recipe.keep + store_both @ law])
+    A = np.hstack([after @ enter_y @ plant.C, after @ recipe.carry])
+    A[:n_x, :n_x] += plant.A
+    by_u = np.vstack([plant.B, store_both])
+    B_r = np.stack([by_u @ on_r[:, i : i + p] for i in range(0, on_r.shape[1], p)])
+    B_r[0] += after @ enter_r
+    B_r[controller.governs_ahead, n_x:] += governed
+    B_u = np.vstack([plant.B, store_seen if seen else 0.0 * store_seen])
+    C = np.hstack([plant.C, np.zeros((p, recipe.layout.size))])
+    return LinearLoop(A, C, B_r, B_u, after @ enter_y, plant.dt)
+
+
+@dataclass(frozen=True, eq=False)
+class ControlPolynomials:
+    r"""Polynomial form of the law on a non-minimal state: (6.4) and Figure 4.1.
+
+    .. math:: L(z) u_k = \frac{K_I}{1 - z^{-1}} (r_k - y_k) - P(z) y_k
+
+    for structures on changes (6.4); with an integral-of-error state the law adds
+    -R(z) r.  ``P`` (na, n_u, n_y) and ``L`` (nb, n_u, n_u) hold coefficients of z^0,
+    z^-1, ...; ``L[0]`` is the identity, and ``K_I`` (n_u, n_y) the integral gain.
+    """
+
+    P: Array
+    L: Array
+    K_I: Array
+
+
+def control_polynomials(controller: PredictiveController) -> ControlPolynomials:
+    """Polynomials of a law on past outputs, past inputs and an integral.
+
+    Raises
+    ------
+    ValueError
+        If the structure has another state, as with an observer.
+    """
+    model = controller.model
+    n_past_y, n_past_u = model.na * model.n_y, (model.nb - 1) * model.n_u
+    K = controller.gain("x")
+    if K.shape[1] != n_past_y + n_past_u + model.n_y:
+        raise ValueError(
+            "this structure's state is not [past outputs, past inputs, integral]: it "
+            "has no polynomials P, L and K_I"
+        )
+    P = K[:, :n_past_y].reshape(model.n_u, model.na, model.n_y).transpose(1, 0, 2)
+    past_u = K[:, n_past_y : n_past_y + n_past_u]
+    L = past_u.reshape(model.n_u, model.nb - 1, model.n_u).transpose(1, 0, 2)
+    K_I = K[:, n_past_y + n_past_u :]
+    sign = -1.0 if controller.form.drive == "u" else 1.0
+    return ControlPolynomials(
+        P, np.concatenate([np.eye(model.n_u)[None], L]), sign * K_I
+    )
+
+
+Verdict = Literal["good", "note", "bad"]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One sentence of a review: its topic, how serious it is, and what was found."""
+
+    topic: str
+    verdict: Verdict
+    sentence: str
+
+
+@dataclass(frozen=True)
+class Review:
+    """Findings about a design; printing it shows them line by line."""
+
+    findings: tuple[Finding, ...]
+
+    @property
+    def is_good(self) -> bool:
+        """Whether nothing bad was found."""
+        return all(finding.verdict != "bad" for finding in self.findings)
+
+    def __str__(self) -> str:
+        """Return the findings, one a line."""
+        marks = {"good": "ok  ", "note": "note", "bad": "BAD "}
+        return "\n".join(
+            f"{marks[f.verdict]} {f.topic}: {f.sentence}" for f in self.findings
+        )
+
+
+def review(
+    controller: Controller, plant: LinearPlant | DifferenceModel | None = None
+) -> Review:
+    """Look a design over and say in sentences what would worry an engineer.
+
+    Parameters
+    ----------
+    controller : Controller
+    plant : LinearPlant or DifferenceModel, optional
+        Plant to judge it on; the model itself if absent.
+
+    Raises
+    ------
+    ValueError
+        If the plant's size differs from the model's.
+    """
+    loop = linear_loop(controller, plant)
+    findings = [_stability(loop), *_offset(loop), *_structure(controller)]
+    if isinstance(controller, PredictiveController):
+        findings += [_conditioning(controller), _dead_time(controller)]
+        findings += _rows_left_out(controller)
+    findings += _conflicts(controller)
+    findings += _hidden(loop)
+    return Review(tuple(findings))
+
+
+def _stability(loop: LinearLoop) -> Finding:
+    radius = f"largest pole {loop.radius:.4f}"
+    if loop.is_stable:
+        return Finding(
+            "stability", "good", f"The loop without limits is stable, {radius}."
+        )
+    if loop.radius < 1.0 + ROUNDING:
+        sentence = f"The loop without limits is only marginally stable, {radius}."
+        return Finding("stability", "bad", sentence)
+    return Finding(
+        "stability",
+        "bad",
+        f"The loop without limits is unstable, {radius}. Lengthen Np, weigh the moves "
+        "more, or use the LQ tail.",
+    )
+
+
+def _offset(loop: LinearLoop) -> list[Finding]:
+    if loop.radius > 1.0 + ROUNDING:
+        return [Finding("offset", "note", "Not looked at: the loop is unstable.")]
+    cases: list[tuple[Transfer, str, Array | float]] = [
+        ("T", "a constant reference", np.eye(len(loop.C))),
+        ("S_i", "a constant disturbance at the input", 0.0),
+        ("S_o", "a constant disturbance at the output", 0.0),
+    ]
+    findings = []
+    for which, what, wanted in cases:
+        error = float(np.abs(loop.transfer(which, 1.0) - wanted).max())
+        if error < 1e-6:
+            sentence = f"No offset remains after {what} ({which}(1) as it should be)."
+            findings.append(Finding("offset", "good", sentence))
+        else:
+            sentence = f"{which}(1) is off by {error:.3g}: {what} leaves an offset."
+            findings.append(Finding("offset", "bad", sentence))
+    return findings
+
+
+def _structure(controller: Controller) -> list[Finding]:
+    form, model = controller.form, controller.model
+    fixed = form.fixed_poles()
+    findings = []
+    if len(fixed):
+        verdict: Verdict = "bad" if np.abs(fixed[0]) >= 1.0 else "note"
+        sentence = (
+            f"The input reaches {form.controllable_rank()} of {form.n_x} states: a "
+            f"common factor leaves fixed poles at {_list(fixed)}."
+        )
+        findings.append(Finding("controllability", verdict, sentence))
+    zeros = model.zeros() if model.n_y == model.n_u else np.zeros(0)
+    outside = zeros[np.abs(zeros) > 1.0]
+    if len(outside):
+        sentence = (
+            f"The plant has zeros outside the unit circle at {_list(outside)}: outputs "
+            "first move the wrong way, and fast control is not to be had."
+        )
+        findings.append(Finding("zeros", "note", sentence))
+    return findings
+
+
+def _conditioning(controller: PredictiveController) -> Finding:
+    condition = float(np.linalg.cond(controller.program.H))
+    if condition < 1e8:
+        return Finding(
+            "conditioning",
+            "good",
+            f"The Hessian's condition number is {condition:.2g}.",
+        )
+    return Finding(
+        "conditioning",
+        "note" if condition < 1e12 else "bad",
+        f"The Hessian's condition number is {condition:.2g}: weigh the moves more, "
+        "shorten Nc, or govern a stabilising gain.",
+    )
+
+
+def _dead_time(controller: PredictiveController) -> Finding:
+    dead = controller.model.dead_time.min(axis=1)
+    late = [
+        f"{name} ({int(wait)} samples)"
+        for name, wait in zip(controller.model.y_names, dead, strict=True)
+        if wait >= controller.horizon.Np
+    ]
+    if late:
+        sentence = (
+            f"Np = {controller.horizon.Np} ends before inputs act on {', '.join(late)}."
+        )
+        return Finding("horizon", "bad", sentence)
+    sentence = f"Np = {controller.horizon.Np} sees past every output's dead time."
+    return Finding("horizon", "good", sentence)
+
+
+def _rows_left_out(controller: PredictiveController) -> list[Finding]:
+    rows = controller.program.left_out
+    if not rows:
+        return []
+    listed = ", ".join(f"{r.name}{r.channel + 1} at step {r.step}" for r in rows[:4])
+    more = f" and {len(rows) - 4} more" if len(rows) > 4 else ""
+    sentence = f"No decision moves {listed}{more}: these limits are not promised."
+    return [Finding("limits", "note", sentence)]
+
+
+def _conflicts(controller: Controller) -> list[Finding]:
+    """Output limits against what the inputs can hold at rest."""
+    model = controller.model
+    gain = model.steady_state_gain()
+    low_u, high_u = controller.limits_u
+    low_y, high_y = controller.limits.of("y", model.n_y)
+    if not (np.isfinite(gain).all() and np.isfinite([low_u, high_u]).all()):
+        return []
+    ends = np.stack([gain * low_u, gain * high_u])
+    lowest, highest = ends.min(axis=0).sum(axis=1), ends.max(axis=0).sum(axis=1)
+    findings = []
+    for i, name in enumerate(model.y_names):
+        sentence = (
+            f"Within the input limits {name} can be held from {lowest[i]:.4g} to "
+            f"{highest[i]:.4g}{_unit(model, name)}; references beyond leave an error."
+        )
+        findings.append(Finding("reach", "note", sentence))
+        if highest[i] < low_y[i] or lowest[i] > high_y[i]:
+            sentence = (
+                f"The limits on {name}, {low_y[i]:.4g} to {high_y[i]:.4g}, cannot be "
+                "held at rest by any allowed input."
+            )
+            findings.append(Finding("limits", "bad", sentence))
+    return findings
+
+
+def _hidden(loop: LinearLoop) -> list[Finding]:
+    modes = loop.hidden_modes
+    if not len(modes):
+        return []
+    slow = np.abs(modes).max() > 1.0 - 1e-6
+    sentence = (
+        f"Hidden modes at {_list(modes)}: the reference does not show them, a "
+        "disturbance does"
+        + (", and they never die out." if slow else ", and they decay on their own.")
+    )
+    return [Finding("hidden modes", "bad" if slow else "note", sentence)]
+
+
+def _unit(model: DifferenceModel, name: str) -> str:
+    return f" {model.units[name]}" if name in model.units else ""
+
+
+def _list(numbers: Array) -> str:
+    return ", ".join(
+        f"{complex(n):.4g}" if np.iscomplex(n) else f"{n.real:.4g}" for n in numbers
+    )
