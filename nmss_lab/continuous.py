@@ -600,7 +600,7 @@ def _assemble(
         a[: _order(row.a), i, i] = row.a[: _order(row.a)]
         b[: len(row.b), i] = row.b
     u, v = b[:, :, :n_u], b[:, :, n_u:]
-    g = v[: max(1, _order(v))] if v.shape[2] else None
+    g = v[: max(1, _order(v))]
     return DifferenceModel(a, u[: max(1, _order(u))], g, dt=dt, **names)
 
 

@@ -7,6 +7,7 @@ shared.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -42,6 +43,8 @@ from nmss_lab.qp import (
     find_backend,
     solve,
 )
+
+LOG = logging.getLogger(__name__)
 
 Reading = Literal["held", "next", "preview", "zero"]
 """What S holds: r_k repeated, r_{k+1} repeated, the true future, or nothing (the
@@ -212,6 +215,7 @@ class PredictiveController(Controller):
             return
         solution, status = self._solve(move.known[i], self._reachable(before))
         if not solution.found:
+            LOG.warning("%s %s", solution.status.value, solution.message)
             self._continue(move, memory, i, before, Status.SHIFTED)
             return
         move.decision[i] = solution.decision

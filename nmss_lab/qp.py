@@ -176,7 +176,8 @@ def assemble(
     """
     table = sum_of_squares(costs)
     n_z = costs[0].signal.gain.shape[1]
-    H, f, constant = table[:n_z, :n_z], table[:n_z, n_z:], table[n_z:, n_z:]
+    H, f = table[:n_z, :n_z].copy(), table[:n_z, n_z:].copy()
+    constant = table[n_z:, n_z:].copy()
     smallest, largest = np.linalg.eigvalsh(H)[[0, -1]]
     if not smallest > 1e-13 * abs(largest):
         raise ValueError(
@@ -185,18 +186,22 @@ def assemble(
             "Weigh the moves more, or correct an indefinite weighting block."
         )
     rows = [_rows(limit) for limit in limits]
-    parts = [part for part, _, _ in rows] or [np.zeros((0, H.shape[0] + f.shape[1]))]
-    rows_table = np.concatenate(parts)
-    M, offset, bounds = np.split(
-        rows_table, [H.shape[0], H.shape[0] + f.shape[1]], axis=1
-    )
-    if not limits:
-        bounds = np.zeros((0, 2))
+    none = np.zeros((0, table.shape[1] + 2))
+    stacked = np.concatenate([none, *(part for part, _, _ in rows)])
+    M, offset, bounds = np.split(stacked, [n_z, table.shape[1]], axis=1)
     labels = tuple(label for _, kept, _ in rows for label in kept)
     left_out = tuple(label for _, _, left in rows for label in left)
     lower, upper = bounds.T
     return QuadraticProgram(
-        H, f, constant, M, offset, lower.copy(), upper.copy(), labels, left_out
+        H,
+        f,
+        constant,
+        M.copy(),
+        offset.copy(),
+        lower.copy(),
+        upper.copy(),
+        labels,
+        left_out,
     )
 
 
