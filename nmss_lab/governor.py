@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 
 from nmss_lab.controller import Limits, Memory, Move
-from nmss_lab.models import Array, DifferenceModel
+from nmss_lab.models import Array, DifferenceModel, Numbers
 from nmss_lab.mpc import Knowledge, PredictiveController, limit
 from nmss_lab.nmss import Layout, integral_of_error_form
 from nmss_lab.pip import gain
@@ -73,7 +73,7 @@ class ReferenceGovernor(PredictiveController):
 
 def governor(
     model: DifferenceModel,
-    K: Array,
+    K: Numbers,
     Np: int,
     limits: Limits,
     reference: Literal["held", "preview"] = "held",

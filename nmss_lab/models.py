@@ -17,6 +17,9 @@ import scipy.linalg
 Array = np.ndarray[Any, np.dtype[Any]]
 """Array of numbers; float64 unless a docstring says otherwise."""
 
+Numbers = Any
+"""Whatever numpy makes an array of, as an argument; an Array once it is stored."""
+
 
 class Plant(Protocol):
     """What a closed loop asks of a plant; any object with these members will do.
@@ -199,9 +202,9 @@ class DifferenceModel:
     3.3333
     """
 
-    a: Array
-    b: Array
-    g: Array = None  # type: ignore[assignment]  # no entries once built
+    a: Numbers
+    b: Numbers
+    g: Numbers = None
     dt: float = 1.0
     y_names: Sequence[str] = ()
     u_names: Sequence[str] = ()

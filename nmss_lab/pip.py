@@ -10,7 +10,7 @@ import numpy as np
 import scipy.signal
 
 from nmss_lab.controller import Controller, Limits, Memory, Move, Status
-from nmss_lab.models import Array, DifferenceModel
+from nmss_lab.models import Array, DifferenceModel, Numbers
 from nmss_lab.mpc import lq_cost, weight
 from nmss_lab.nmss import Form, incremental_pip_form, integral_of_error_form
 
@@ -71,7 +71,7 @@ class StateFeedback(Controller):
 
 def pip(
     model: DifferenceModel,
-    K: Array,
+    K: Numbers,
     limits: Limits | None = None,
     law: Literal["incremental", "positional"] = "incremental",
     path: Literal["feedback", "forward"] = "feedback",

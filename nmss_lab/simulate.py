@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from nmss_lab.controller import Controller, Memory, Move, Status
-from nmss_lab.models import Array, LinearPlant, Plant
+from nmss_lab.models import Array, LinearPlant, Numbers, Plant
 from nmss_lab.mpc import PredictiveController
 
 
@@ -43,17 +43,17 @@ class Scenario:
         If lengths differ, or a value other than noise or manual is not finite.
     """
 
-    reference: Array
-    v: Array | None = None
-    input_disturbance: Array | None = None
-    output_disturbance: Array | None = None
-    noise: Array | None = None
-    manual: Array | None = None
+    reference: Numbers
+    v: Numbers | None = None
+    input_disturbance: Numbers | None = None
+    output_disturbance: Numbers | None = None
+    noise: Numbers | None = None
+    manual: Numbers | None = None
     actuator: tuple[Any, Any] = (-np.inf, np.inf)
     seen: bool = False
-    y0: Array | None = None
-    u0: Array | None = None
-    v0: Array | None = None
+    y0: Numbers | None = None
+    u0: Numbers | None = None
+    v0: Numbers | None = None
 
     def __post_init__(self) -> None:
         """Check lengths and make every series two-dimensional."""
