@@ -1,5 +1,72 @@
 """Predictive control structures in the non-minimal state space."""
 
-__all__ = ["__version__"]
+from nmss_lab.analysis import (
+    LinearLoop,
+    Review,
+    control_polynomials,
+    linear_loop,
+    review,
+)
+from nmss_lab.continuous import ContinuousPlant, TransferFunction, difference_model
+from nmss_lab.controller import Controller, Limits, Memory, Move, Status
+from nmss_lab.design import Design
+from nmss_lab.governor import governor
+from nmss_lab.models import DifferenceModel, LinearPlant, Plant
+from nmss_lab.mpc import (
+    STRUCTURES,
+    PredictiveController,
+    disturbance_augmented,
+    disturbance_direct,
+    forward_path,
+    integral_of_error,
+    minimal,
+    state_weight,
+    wang_young,
+)
+from nmss_lab.pip import lq_gain, pip, pole_gain
+from nmss_lab.predict import Horizon
+from nmss_lab.records import Record
+from nmss_lab.simulate import Run, Scenario, closed_loop, closed_loops, samples
+
+__all__ = [
+    "STRUCTURES",
+    "ContinuousPlant",
+    "Controller",
+    "Design",
+    "DifferenceModel",
+    "Horizon",
+    "Limits",
+    "LinearLoop",
+    "LinearPlant",
+    "Memory",
+    "Move",
+    "Plant",
+    "PredictiveController",
+    "Record",
+    "Review",
+    "Run",
+    "Scenario",
+    "Status",
+    "TransferFunction",
+    "__version__",
+    "closed_loop",
+    "closed_loops",
+    "control_polynomials",
+    "difference_model",
+    "disturbance_augmented",
+    "disturbance_direct",
+    "forward_path",
+    "governor",
+    "integral_of_error",
+    "linear_loop",
+    "lq_gain",
+    "minimal",
+    "pip",
+    "pole_gain",
+    "review",
+    "samples",
+    "state_weight",
+    "wang_young",
+]
 
 __version__ = "0.1.0"

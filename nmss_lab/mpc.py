@@ -25,6 +25,7 @@ from nmss_lab.nmss import (
     integral_of_error_form,
     minimal_form,
 )
+from nmss_lab.pip import lq_cost
 from nmss_lab.predict import (
     Affine,
     Horizon,
@@ -42,6 +43,7 @@ from nmss_lab.qp import (
     assemble,
     find_backend,
     solve,
+    weight,
 )
 
 LOG = logging.getLogger(__name__)
@@ -774,41 +776,6 @@ def output_ranks(program: QuadraticProgram, limits: Limits, n_y: int) -> Array:
     )
 
 
-def weight(name: str, value: Any, steps: int, size: int) -> Array:
-    """Block-diagonal weight (steps size, steps size), symmetric.
-
-    Accepts a number, one weight a channel (size,), a matrix (size, size), one number a
-    step (steps,) for a single channel, one matrix a step (steps, size, size), or the
-    full matrix.
-
-    Raises
-    ------
-    ValueError
-        If the shape is another, or an entry is not finite.
-    """
-    array = np.asarray(value, dtype=float)
-    if not np.isfinite(array).all():
-        raise ValueError(f"{name} holds entries that are not finite")
-    if array.shape == (steps * size, steps * size) and steps > 1:
-        return (array + array.T) / 2.0
-    if size == 1 and array.shape == (steps,):
-        array = array[:, None, None]
-    if array.ndim == 0:
-        array = array * np.eye(size)
-    if array.shape == (size,):
-        array = np.diag(array)
-    if array.shape == (size, size):
-        array = np.broadcast_to(array, (steps, size, size))
-    if array.shape != (steps, size, size):
-        raise ValueError(
-            f"{name} has shape {np.shape(value)}, expected a number, ({size},), "
-            f"({size}, {size}), ({steps}, {size}, {size}) or the full "
-            f"({steps * size}, {steps * size})"
-        )
-    full: Array = scipy.linalg.block_diag(*((step + step.T) / 2.0 for step in array))
-    return full
-
-
 def state_weight(
     model: DifferenceModel, weight_y: Any, weight_past_u: Any, weight_integral: Any
 ) -> Array:
@@ -822,24 +789,6 @@ def state_weight(
     parts.append(weight("weight_integral", weight_integral, 1, model.n_y))
     joined: Array = scipy.linalg.block_diag(*parts)
     return joined
-
-
-def lq_cost(A: Array, B: Array, Q: Array, R: Array) -> Array:
-    """Infinite-horizon cost matrix P of x'Qx + u'Ru.
-
-    Raises
-    ------
-    ValueError
-        If the Riccati equation has no stabilising solution.
-    """
-    try:
-        P: Array = scipy.linalg.solve_discrete_are(A, B, Q, R)
-    except (np.linalg.LinAlgError, ValueError) as error:
-        raise ValueError(
-            "the LQ problem has no stabilising solution: an unstable mode is not "
-            f"reached by the input or not seen by the weights ({error})"
-        ) from error
-    return P
 
 
 def _riccati(form: Form, Q: Array, R: Array, n_u: int) -> Array:

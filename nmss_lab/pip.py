@@ -7,12 +7,13 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
+import scipy.linalg
 import scipy.signal
 
 from nmss_lab.controller import Controller, Limits, Memory, Move, Status
 from nmss_lab.models import Array, DifferenceModel, Numbers
-from nmss_lab.mpc import lq_cost, weight
 from nmss_lab.nmss import Form, incremental_pip_form, integral_of_error_form
+from nmss_lab.qp import weight
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,6 +135,24 @@ def lq_gain(model: DifferenceModel, Q: Any, R: Any) -> Array:
     P = lq_cost(form.A, form.B, Q, R)
     K: Array = np.linalg.solve(R + form.B.T @ P @ form.B, form.B.T @ P @ form.A)
     return K
+
+
+def lq_cost(A: Array, B: Array, Q: Array, R: Array) -> Array:
+    """Infinite-horizon cost matrix P of x'Qx + u'Ru.
+
+    Raises
+    ------
+    ValueError
+        If the Riccati equation has no stabilising solution.
+    """
+    try:
+        P: Array = scipy.linalg.solve_discrete_are(A, B, Q, R)
+    except (np.linalg.LinAlgError, ValueError) as error:
+        raise ValueError(
+            "the LQ problem has no stabilising solution: an unstable mode is not "
+            f"reached by the input or not seen by the weights ({error})"
+        ) from error
+    return P
 
 
 def pole_gain(model: DifferenceModel, poles: Sequence[complex]) -> Array:

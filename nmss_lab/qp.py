@@ -16,7 +16,7 @@ import importlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.linalg
@@ -215,7 +215,7 @@ def sum_of_squares(costs: Sequence[Cost]) -> Array:
 
 
 def _rows(limit: Limit) -> tuple[Array, list[Row], list[Row]]:
-    """Rows [gain, known, lower, upper] that matter, their labels, and those left out."""
+    """Rows [gain, known, lower, upper] that matter, their labels, and the others."""
     labels = [
         Row(limit.name, i, int(step))
         for step in limit.steps
@@ -230,6 +230,41 @@ def _rows(limit: Limit) -> tuple[Array, list[Row], list[Row]]:
     kept = [label for label, ok in zip(labels, bounded & moved, strict=True) if ok]
     left = [label for label, ok in zip(labels, bounded & ~moved, strict=True) if ok]
     return table[bounded & moved], kept, left
+
+
+def weight(name: str, value: Any, steps: int, size: int) -> Array:
+    """Block-diagonal weight (steps size, steps size), symmetric.
+
+    Accepts a number, one weight a channel (size,), a matrix (size, size), one number a
+    step (steps,) for a single channel, one matrix a step (steps, size, size), or the
+    full matrix.
+
+    Raises
+    ------
+    ValueError
+        If the shape is another, or an entry is not finite.
+    """
+    array = np.asarray(value, dtype=float)
+    if not np.isfinite(array).all():
+        raise ValueError(f"{name} holds entries that are not finite")
+    if array.shape == (steps * size, steps * size) and steps > 1:
+        return (array + array.T) / 2.0
+    if size == 1 and array.shape == (steps,):
+        array = array[:, None, None]
+    if array.ndim == 0:
+        array = array * np.eye(size)
+    if array.shape == (size,):
+        array = np.diag(array)
+    if array.shape == (size, size):
+        array = np.broadcast_to(array, (steps, size, size))
+    if array.shape != (steps, size, size):
+        raise ValueError(
+            f"{name} has shape {np.shape(value)}, expected a number, ({size},), "
+            f"({size}, {size}), ({steps}, {size}, {size}) or the full "
+            f"({steps * size}, {steps * size})"
+        )
+    full: Array = scipy.linalg.block_diag(*((step + step.T) / 2.0 for step in array))
+    return full
 
 
 class QPStatus(enum.Enum):
