@@ -1,0 +1,576 @@
+"""The worked examples as data: plant, designs, scenario, and what is assumed.
+
+``CASES`` maps a name to a function that builds the case; ``case(name)`` calls it.
+Sections and equations are those of the thesis (see CITATION.cff) unless a source says
+otherwise.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from nmss_lab.continuous import ContinuousPlant, TransferFunction
+from nmss_lab.controller import Limits
+from nmss_lab.design import Design
+from nmss_lab.models import Array, DifferenceModel, LinearPlant
+from nmss_lab.mpc import state_weight
+from nmss_lab.pip import lq_gain, pole_gain
+from nmss_lab.predict import Horizon
+from nmss_lab.simulate import Scenario
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """A worked example.
+
+    Parameters
+    ----------
+    name, title : str
+    section : str
+        Section of the thesis, or of the source.
+    source : str
+        Where the numbers come from.
+    plant : LinearPlant
+        Sampled plant; with outputs between the samples if it comes from continuous
+        time.
+    designs : mapping of str to Design
+        Controllers to compare, by a name for display.
+    scenario : Scenario
+    notes : tuple of str
+        What is assumed, what is synthetic, and what differs from the printed text.
+    bands : mapping of str to (low, high), optional
+        Levels of the outputs that the example calls acceptable; numbers or one entry
+        an output.
+    continuous : ContinuousPlant, optional
+        Plant in continuous time, where there is one.
+    covariance : array, optional
+        Covariance of the model's parameters, in the order a_1 ... a_na, b_1 ... b_nb.
+    """
+
+    name: str
+    title: str
+    section: str
+    source: str
+    plant: LinearPlant
+    designs: Mapping[str, Design]
+    scenario: Scenario
+    notes: tuple[str, ...]
+    bands: Mapping[str, tuple[Any, Any]] = field(default_factory=dict)
+    continuous: ContinuousPlant | None = None
+    covariance: Array | None = None
+
+    @property
+    def model(self) -> DifferenceModel:
+        """Model of the first design."""
+        return next(iter(self.designs.values())).model
+
+
+def case(name: str) -> Case:
+    """Build the case of that name.
+
+    Raises
+    ------
+    ValueError
+        If there is none.
+
+    Examples
+    --------
+    >>> case("governor_3_4").section
+    '3.4'
+    """
+    if name not in CASES:
+        raise ValueError(f'case "{name}": expected one of {", ".join(CASES)}')
+    return CASES[name]()
+
+
+def predictive(design: Design, *structures: str) -> dict[str, Design]:
+    """Design with each of the structures, all else equal."""
+    return {name: dataclasses.replace(design, structure=name) for name in structures}
+
+
+def piecewise(samples: int, *changes: tuple[int, Any]) -> Array:
+    """Series (samples, channels) that takes a value from each given sample on.
+
+    Each change is (first sample, value); zero before the first.
+
+    Examples
+    --------
+    >>> piecewise(5, (1, 2.0), (4, -1.0)).ravel()
+    array([ 0.,  2.,  2.,  2., -1.])
+    """
+    series = np.zeros((samples, np.size(changes[0][1])))
+    for first, value in changes:
+        series[first:] = value
+    return series
+
+
+# Chapter 3
+
+
+def governor_3_4() -> Case:
+    """Govern the reference of a fast PIP loop."""
+    model = DifferenceModel([-1.7, 1.0], [-1.0, 2.0])
+    limits = Limits(u=(-2.0, 2.0), du=(-0.5, 0.5))
+    K = pole_gain(model, [0.0, 0.0, 0.2, 0.2])
+    governed = Design(
+        "governor", model, Horizon(10, 10), limits=limits, options={"K": K}
+    )
+    mpc = Design("wang_young", model, Horizon(20, 5), 1 / 20, 1 / 5, limits)
+    integral = Design(
+        "integral_of_error", model, Horizon(20, 5), 1 / 20, 1 / 5, limits, "zero"
+    )
+    return Case(
+        name="governor_3_4",
+        title="Reference governor over a marginally stable plant",
+        section="3.4",
+        source="Plant of (6.10), poles, limits and set-points of section 3.4",
+        plant=model.plant(),
+        designs={
+            "governor": governed,
+            "pip": Design("pip", model, limits=limits, options={"K": K}),
+            "integral_of_error": integral,
+            **predictive(mpc, "wang_young", "forward_path", "minimal"),
+        },
+        scenario=Scenario(piecewise(60, (5, 5.0), (31, -5.0))),
+        notes=(
+            "The first input coefficient is -1, as in (6.10); -0.5 is printed in 3.4, "
+            "but the printed gain stabilises the plant only with -1.",
+            "The reference is not previewed: the governor chooses w_k at sample k.",
+            "PIP is the incremental law (3.13) with its two corrected branches, so "
+            "nothing winds up.",
+            "The steady-state gain is 10/3, so inputs up to 2 hold outputs up to "
+            "6.67 only.",
+            "The predictive designs, not part of this section, take the horizons and "
+            "weights of 6.3.2.",
+        ),
+    )
+
+
+# Chapter 4
+
+
+def double_integrator_4_4_1() -> Case:
+    """Disturbance rejection on a double integrator."""
+    model = DifferenceModel([-2.0, 1.0], [0.5, 0.5])
+    limits = Limits(u=(-10.0, 10.0), du=(-7.0, 7.0))
+    design = Design(
+        "integral_of_error", model, Horizon(5, 3), 5 / 15, 1 / 3, limits, "zero"
+    )
+    mpc = dataclasses.replace(design, Q=1.0, R=1.0, reference="held")
+    K = lq_gain(model, 5 / 15, 1 / 3)
+    pip = Design("pip", model, limits=limits, options={"K": K})
+    governed = Design(
+        "governor", model, Horizon(15, 15), limits=limits, options={"K": K}
+    )
+    return Case(
+        name="double_integrator_4_4_1",
+        title="Double integrator with input and output disturbances",
+        section="4.4.1",
+        source="Section 4.4.1",
+        plant=model.plant(),
+        designs={
+            "integral_of_error": design,
+            **predictive(mpc, "wang_young", "forward_path", "minimal"),
+            "pip": pip,
+            "governor": governed,
+        },
+        scenario=Scenario(
+            np.zeros(41),
+            output_disturbance=piecewise(41, (5, 15.0)),
+            input_disturbance=piecewise(41, (20, -5.0)),
+        ),
+        notes=(
+            "The output disturbance of 15 is added to the output, the input "
+            "disturbance of -5 to the plant's input; no controller knows of either.",
+            "Q = 5/15 is printed as weight over horizon although Np = 5; the value is "
+            "used as printed.",
+            "Inputs of the forward path's internal model are undisturbed: its hidden "
+            "double integrator is never damped, and it cannot hold the output.",
+            "The printed example has one structure; weights of the others, and the LQ "
+            "gain of PIP and governor, are our choice.",
+        ),
+    )
+
+
+def ifac93_plant(
+    T1: float = 5.0,
+    T2: float = 0.4,
+    w0: float = 5.0,
+    zeta: float = 0.3,
+    K: float = 1.0,
+) -> ContinuousPlant:
+    """Build the IFAC'93 benchmark plant of 7th order, (4.22).
+
+    Parameters
+    ----------
+    T1, T2 : float
+        Time constants of the slow pole and of the right-hand zero, in seconds.
+    w0, zeta : float
+        Frequency in rad/s and damping of the resonance.
+    K : float
+        Steady-state gain.
+    """
+    fast = 15.0
+    num = K * w0**2 * fast**2 * np.array([-T2, 1.0])
+    den: Array = np.ones(1)
+    for factor in (
+        [1.0, 2.0 * zeta * w0, w0**2],
+        [T1, 1.0],
+        [1.0, 2.0 * 0.6 * fast, fast**2],
+        [1 / 8, 1.0],
+        [1 / 12, 1.0],
+    ):
+        den = np.polymul(den, factor)
+    return ContinuousPlant([[TransferFunction(num.tolist(), den.tolist())]])
+
+
+STRESS_LEVELS: dict[int, dict[str, float]] = {
+    1: {"T1": 0.20, "T2": 0.05, "w0": 1.50, "zeta": 0.10, "K": 0.0},
+    2: {"T1": 0.30, "T2": 0.10, "w0": 2.50, "zeta": 0.15, "K": 0.15},
+    3: {"T1": 0.30, "T2": 0.15, "w0": 3.00, "zeta": 0.15, "K": 0.50},
+}
+"""Largest deviations of the IFAC'93 plant's parameters, Table 4.1."""
+
+
+def stress_corners(level: int) -> list[ContinuousPlant]:
+    """Extremes of a stress level of the IFAC'93 plant (Table 4.1), 32 plants.
+
+    They come in the order of ``itertools.product((-1, 1), repeat=5)`` on T1, T2, w0,
+    zeta, K.  Level 1 leaves K alone, so that its plants come in pairs.
+
+    Raises
+    ------
+    ValueError
+        If there is no such level.
+    """
+    if level not in STRESS_LEVELS:
+        raise ValueError(f"level = {level}: expected 1, 2 or 3")
+    nominal = {"T1": 5.0, "T2": 0.4, "w0": 5.0, "zeta": 0.3, "K": 1.0}
+    deviation = STRESS_LEVELS[level]
+    return [
+        ifac93_plant(
+            **{
+                name: value + sign * deviation[name]
+                for sign, (name, value) in zip(signs, nominal.items(), strict=True)
+            }
+        )
+        for signs in itertools.product((-1, 1), repeat=5)
+    ]
+
+
+def square_wave(samples: int, half_period: int) -> Array:
+    """Series (samples, 1) that is 1, then -1, and so on, ``half_period`` each."""
+    wave: Array = 1.0 - 2.0 * (np.arange(samples) // half_period % 2)
+    return wave[:, None]
+
+
+IFAC93_BANDS = {"wanted": (-1.2, 1.2), "allowed": (-1.5, 1.5)}
+IFAC93_SOURCE = (
+    "Plant (4.22) of the IFAC'93 benchmark (Whidborne et al., 1995), model (4.23), "
+    "Table 4.1"
+)
+
+
+def ifac93_model() -> DifferenceModel:
+    """Model (4.23), sampled at 0.5 s."""
+    return DifferenceModel([-0.9055], [0.0, 0.0946], dt=0.5)
+
+
+def ifac93_4_4_2() -> Case:
+    """IFAC'93 benchmark with the sum of the error in the state."""
+    model, continuous = ifac93_model(), ifac93_plant()
+    limits = Limits(u=(-5.0, 5.0))
+    design = Design(
+        "integral_of_error", model, Horizon(50, 10), 1.0, 0.1, limits, "zero"
+    )
+    mpc = dataclasses.replace(design, Q=0.085, reference="held")
+    K = lq_gain(model, 1.0, 0.1)
+    return Case(
+        name="ifac93_4_4_2",
+        title="IFAC'93 benchmark, sum of the error in the state",
+        section="4.4.2",
+        source=IFAC93_SOURCE,
+        plant=continuous.sampled(0.5, substeps=50),
+        designs={
+            "integral_of_error": design,
+            **predictive(mpc, "wang_young", "forward_path", "minimal"),
+            "pip": Design("pip", model, limits=limits, options={"K": K}),
+            "governor": Design(
+                "governor", model, Horizon(15, 15), limits=limits, options={"K": K}
+            ),
+        },
+        scenario=Scenario(square_wave(120, 20)),
+        notes=(
+            "The plant is of 7th order, the model of first order with a dead time: "
+            "model and plant differ even nominally.",
+            "The reference enters the integral-of-error design through the sum of the "
+            "error alone (S = 0); only this reading gives figures 4.3 and 4.4.",
+            "The weights of Wang and Young's design are not printed; 0.085 and 0.1 "
+            "settle in a similar time.",
+            "The LQ gain of PIP and governor, for the same weights, is our addition.",
+        ),
+        bands=IFAC93_BANDS,
+        continuous=continuous,
+    )
+
+
+# Chapter 5
+
+SHELL_A = [
+    np.diag([-1.6637, -2.4418, -1.9553]),
+    np.diag([0.6918, 1.9864, 1.2334]),
+    np.diag([0.0, -0.5383, -0.2473]),
+]
+SHELL_B = [
+    [[0.0, 0.0, 0.0], [0.0, 0.4173, 0.5851], [0.0, 0.0, 3.9167]],
+    [[0.1232, 0.0, 0.1789], [0.9853, -0.2036, -0.0301], [0.9993, 0.8873, -6.0118]],
+    [
+        [0.5079, 0.2737, 0.7375],
+        [-1.6010, -0.4722, -1.1641],
+        [-1.0690, -0.6085, 2.3036],
+    ],
+    [[-0.5173, -0.2241, -0.7511], [0.6493, 0.2940, 0.6520], [0.1557, -0.2109, 0.0]],
+    [[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0492, 0.1303, 0.0]],
+]
+SHELL_DEAD_TIMES = (2, 1, 1)
+"""Samples before any input reaches each output of (5.7)."""
+
+
+def shell_model() -> DifferenceModel:
+    """Shell fractionator as the difference equation (5.7)."""
+    return DifferenceModel(np.array(SHELL_A), np.array(SHELL_B), dt=10.0)
+
+
+def shell_desired(samples: int, output: int) -> Array:
+    """Desired outputs (samples, 3) for a unit step of one reference, (5.8).
+
+    The response of first order with its pole at 0.7 starts after the dead time of the
+    output; the other outputs stay at zero.
+    """
+    desired = np.zeros((samples, 3))
+    k = np.arange(samples - SHELL_DEAD_TIMES[output] + 1)
+    desired[samples - len(k) :, output] = 1.0 - 0.7**k
+    return desired
+
+
+def shell_step(samples: int, output: int) -> Scenario:
+    """Scenario with a unit step of one reference from sample 1 on.
+
+    A controller that reads r_{k+1} acts at sample 0.
+    """
+    return Scenario(piecewise(samples, (1, np.eye(3)[output])))
+
+
+def shell_weights(name: str) -> tuple[Any, Any, Any, Any]:
+    """Give the printed weights w_y, w_u-, w_z, w_u of row "a" or "b" of Table 5.2.
+
+    Entry (2, 2) of w_u in row b is printed as 0.005; 0.2575 gives the printed table.
+    """
+    rows: dict[str, tuple[Any, Any, Any, Any]] = {
+        "a": (
+            [
+                [0.9873, 0.1308, 0.0097],
+                [0.1308, 0.4687, 0.0433],
+                [0.0097, 0.0433, 0.8913],
+            ],
+            [[0.4785, 0.5, 0.5], [0.5, 0.3093, 0.005], [0.5, 0.005, 0.1895]],
+            [
+                [0.0792, 0.0167, 0.0050],
+                [0.0167, 0.0327, 0.0140],
+                [0.0050, 0.0140, 0.0758],
+            ],
+            [
+                [0.9705, 0.0648, 0.4984],
+                [0.0648, 0.9987, 0.0050],
+                [0.4984, 0.0050, 0.0154],
+            ],
+        ),
+        "b": (
+            [0.2164, 0.2940, 1.0],
+            [0.01, 0.01, 0.01],
+            [
+                [0.0345, 0.0122, 0.0050],
+                [0.0122, 0.0583, 0.0050],
+                [0.0050, 0.0050, 0.1076],
+            ],
+            [0.005, 0.2575, 0.01],
+        ),
+    }
+    return rows[name]
+
+
+SHELL_WANG = (
+    [[0.0642, 0.0050, 0.0612], [0.0050, 0.2921, 0.0050], [0.0612, 0.0050, 0.2344]],
+    [[1.8544, 1.7499, 0.6671], [1.7499, 1.6666, 1.0602], [0.6671, 1.0602, 6.1138]],
+)
+"""Q and R of Wang and Young's design, Q(3, 2) corrected to 0.0050."""
+
+SHELL_MINIMAL = (
+    [[0.0664, 0.0050, 0.0634], [0.0050, 0.3033, 0.0050], [0.0634, 0.0050, 0.2420]],
+    [[1.9229, 1.8211, 0.7260], [1.8211, 1.7400, 1.1332], [0.7260, 1.1332, 6.4104]],
+)
+"""Q and R of the minimal design, Q(3, 2) corrected to 0.0050."""
+
+
+def shell_designs() -> dict[str, Design]:
+    """Four designs of Table 5.2, and the forward path with Wang and Young's weights."""
+    model, horizon = shell_model(), Horizon(10, 5)
+    designs = {}
+    for row, name in (("a", "integral_of_error"), ("b", "integral_of_error_b")):
+        w_y, w_past_u, w_z, w_u = shell_weights(row)
+        Q = state_weight(model, np.array(w_y), np.array(w_past_u), np.array(w_z))
+        designs[name] = Design(
+            "integral_of_error", model, horizon, Q, np.array(w_u), reference="next"
+        )
+    Q, R = map(np.array, SHELL_WANG)
+    wang = Design("wang_young", model, horizon, Q, R, reference="next")
+    Q, R = map(np.array, SHELL_MINIMAL)
+    designs |= predictive(wang, "wang_young", "forward_path")
+    designs["minimal"] = dataclasses.replace(wang, structure="minimal", Q=Q, R=R)
+    return designs
+
+
+def shell_5_3_2() -> Case:
+    """Shell heavy oil fractionator with the designed response of Table 5.2."""
+    model = shell_model()
+    steps = piecewise(
+        90, (1, [1.0, 0.0, 0.0]), (31, [1.0, 1.0, 0.0]), (61, [1.0, 1.0, 1.0])
+    )
+    return Case(
+        name="shell_5_3_2",
+        title="Shell heavy oil fractionator, designed response",
+        section="5.3.2",
+        source="Model (5.7), weights of 5.3.2.2, Table 5.2",
+        plant=model.plant(),
+        designs=shell_designs(),
+        scenario=Scenario(steps),
+        notes=(
+            "The plant is the difference equation (5.7) itself, without limits. Its "
+            "third output is not the third output of Table 5.1.",
+            "The controllers know r_{k+1} one sample ahead; this reading gives Table "
+            "5.2.",
+            "Printed weights with corrections: Q(3,2) of the Wang-Young and minimal "
+            "designs is 0.0050, and w_u(2,2) of row b is 0.2575.",
+            "Some printed weights are indefinite; the condensed Hessian is positive "
+            "definite all the same.",
+            "The three references step one after the other; Table 5.2 has a separate "
+            "run for each.",
+        ),
+    )
+
+
+# Chapter 6
+
+MARGINAL_COVARIANCE = 1e-4 * np.array(
+    [
+        [0.4, -0.33, -4.2, 7.9],
+        [-0.33, 0.38, -1.2, -2.9],
+        [-4.2, -1.2, 410.0, -380.0],
+        [7.9, -2.9, -380.0, 440.0],
+    ]
+)
+"""P* of section 6.3.2, order a_1, a_2, b_1, b_2."""
+
+
+def pulse(samples: int, first: int, length: int, height: float) -> Array:
+    """Series (samples, 1) that is ``height`` for ``length`` samples and zero else."""
+    return piecewise(samples, (first, height), (first + length, 0.0))
+
+
+def marginally_stable_6_3_2() -> Case:
+    """Marginally stable plant: feedback against forward path."""
+    model = DifferenceModel([-1.7, 1.0], [-1.0, 2.0])
+    design = Design("wang_young", model, Horizon(20, 5), 1 / 20, 1 / 5)
+    K = pole_gain(model, [0.0, 0.5, 0.4 + 0.3j, 0.4 - 0.3j])
+    return Case(
+        name="marginally_stable_6_3_2",
+        title="Marginally stable plant, feedback and forward path",
+        section="6.3.2",
+        source="Plant (6.10), horizons, weights and P* of section 6.3.2",
+        plant=model.plant(),
+        designs={
+            **predictive(design, "wang_young", "forward_path", "minimal"),
+            "integral_of_error": dataclasses.replace(
+                design, structure="integral_of_error", reference="zero"
+            ),
+            "pip": Design("pip", model, options={"K": K}),
+            "pip_forward": Design("pip", model, options={"K": K, "path": "forward"}),
+        },
+        scenario=Scenario(
+            np.ones(150),
+            input_disturbance=pulse(150, 20, 30, 0.2),
+            output_disturbance=pulse(150, 80, 20, -0.5),
+            seen=True,
+        ),
+        notes=(
+            "The internal model of the forward path sees the disturbed input: figure "
+            "6.5 comes out only so. If it does not, its hidden modes on the unit "
+            "circle make the loop oscillate for ever after the input disturbance.",
+            "The reference is held at r_k.",
+            "P* belongs to a_1, a_2, b_1, b_2 in this order; it was scaled up on "
+            "purpose.",
+            "Integral-of-error design with the same numbers as weights, and PIP with "
+            "poles near the nominal ones, are our additions.",
+        ),
+        covariance=MARGINAL_COVARIANCE,
+    )
+
+
+FORWARD_OPTIMISED = (
+    [0.4394, 0.1545, 0.1465, 0.2611, 0.4041, 0.4914, 0.5561, 0.6027, 0.6354, 0.6572],
+    [0.001, 0.9284, 0.9072, 0.8042, 0.6891],
+)
+"""Diagonals of Q and R along the horizons, section 6.3.3."""
+
+
+def ifac93_6_3_3() -> Case:
+    """IFAC'93 benchmark: feedback, forward path, and the optimised forward path."""
+    model, continuous = ifac93_model(), ifac93_plant()
+    limits = Limits(u=(-5.0, 5.0))
+    design = Design("wang_young", model, Horizon(50, 10), 10 / 50, 1 / 10, limits)
+    Q, R = map(np.array, FORWARD_OPTIMISED)
+    tuned = dataclasses.replace(design, horizon=Horizon(10, 5), Q=Q, R=R)
+    integral = Design(
+        "integral_of_error", model, Horizon(50, 10), 1.0, 0.1, limits, "zero"
+    )
+    return Case(
+        name="ifac93_6_3_3",
+        title="IFAC'93 benchmark, feedback and forward path",
+        section="6.3.3",
+        source=IFAC93_SOURCE + ", weights of section 6.3.3",
+        plant=continuous.sampled(0.5, substeps=50),
+        designs={
+            **predictive(design, "wang_young", "forward_path", "minimal"),
+            "forward_path_optimised": predictive(tuned, "forward_path")["forward_path"],
+            "feedback_optimised": tuned,
+            "integral_of_error": integral,
+        },
+        scenario=Scenario(square_wave(120, 20)),
+        notes=(
+            "The reference is held at r_k.",
+            "The optimised weights, 10 for Q and 5 for R, belong to Np = 10 and "
+            "Nc = 5; they were found for the forward path.",
+            "Nothing disturbs the input, so it does not matter what the internal model "
+            "sees.",
+            "The integral-of-error design is the one of 4.4.2.",
+        ),
+        bands=IFAC93_BANDS,
+        continuous=continuous,
+    )
+
+
+CASES: dict[str, Callable[[], Case]] = {
+    "governor_3_4": governor_3_4,
+    "double_integrator_4_4_1": double_integrator_4_4_1,
+    "ifac93_4_4_2": ifac93_4_4_2,
+    "shell_5_3_2": shell_5_3_2,
+    "marginally_stable_6_3_2": marginally_stable_6_3_2,
+    "ifac93_6_3_3": ifac93_6_3_3,
+}
+"""Functions that build the cases, by name."""
