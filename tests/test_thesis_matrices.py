@@ -56,7 +56,7 @@ def past_matrices(model):
 
 
 def form_3_3(model):
-    """A, B, C, D of (3.3)."""
+    """Return A, B, C, D of (3.3)."""
     p = model.n_y
     inner, B_past = past_matrices(model)
     n = len(inner) + p
@@ -72,7 +72,7 @@ def form_3_3(model):
 
 
 def form_4_6(model):
-    """A, B, C of (4.5), (4.6), with C_Delta where C_m is printed."""
+    """Return A, B, C of (4.6), with C_Delta where C_m is printed."""
     p = model.n_y
     A_delta, B_delta = past_matrices(model)
     n = len(A_delta)
@@ -85,6 +85,7 @@ def form_4_6(model):
 
 
 def test_form_with_the_sum_of_the_error_is_3_3(rng, sizes):
+    """Every block of (3.3)."""
     model = random_model(rng, *sizes)
     form = integral_of_error_form(model)
     for name, wanted in zip("ABCD", form_3_3(model), strict=True):
@@ -100,6 +101,7 @@ def test_state_has_as_many_entries_as_the_corrected_count(rng, sizes):
 
 
 def test_differenced_form_is_4_6(rng, sizes):
+    """Every block of (4.6)."""
     model = random_model(rng, *sizes)
     form = differenced_form(model)
     for name, wanted in zip("ABC", form_4_6(model), strict=True):
@@ -186,7 +188,7 @@ def one_sided(parts, limits):
 
 
 def random_theta(controller, rng, S):
-    """A known vector with a random state and input and the reference ``S``."""
+    """Return a known vector with a random state and input and the reference ``S``."""
     layout = controller.knowledge.layout
     theta = rng.standard_normal(layout.size)
     theta[layout["r"]] = S
@@ -219,6 +221,7 @@ def matrices_3(model, K):
 
 
 def test_governor_predicts_with_3_8_to_3_10(governed):
+    """Effects of state, reference, last input and perturbation."""
     model, K, limits = governed
     c = governor(model, K, NP, limits, reference="preview")
     F, H_r, K_1, K_2, C_1, C_2, C_bar = matrices_3(model, K)
@@ -238,6 +241,7 @@ def test_governor_predicts_with_3_8_to_3_10(governed):
 
 
 def test_governor_program_is_3_12(rng, governed):
+    """M, N, H and p; rows that no perturbation moves are left out."""
     model, K, limits = governed
     p, q = model.n_y, model.n_u
     c = governor(model, K, NP, limits, reference="preview")
@@ -284,6 +288,7 @@ def matrices_4(model):
 
 
 def test_integral_of_error_predicts_with_4_14(ioe):
+    """F, Phi + Phi_1 and H_r."""
     model, Q, R, limits = ioe
     c = integral_of_error(model, Horizon(NP, NC), Q, R, limits, "preview")
     F, Phi, H_r, C_bar = matrices_4(model)
@@ -294,6 +299,7 @@ def test_integral_of_error_predicts_with_4_14(ioe):
 
 
 def test_integral_of_error_program_is_4_16(rng, ioe):
+    """H, p, M and N."""
     model, Q, R, limits = ioe
     p, q = model.n_y, model.n_u
     c = integral_of_error(model, Horizon(NP, NC), Q, R, limits, "preview")
@@ -317,6 +323,7 @@ def test_integral_of_error_program_is_4_16(rng, ioe):
 
 
 def test_free_law_is_4_17(rng, ioe):
+    """K_s and R_s."""
     model, Q, R, _ = ioe
     c = integral_of_error(model, Horizon(NP, NC), Q, R, None, "preview")
     F, Phi, H_r, _ = matrices_4(model)
@@ -344,7 +351,7 @@ def incremental(rng, sizes):
 
 def incremental_program(c, model, Q, R, limits, S, theta, offset):
     """Compare H, f, M, N with (4.10), (7.7) and the M, N of section 7.3."""
-    p, q = model.n_y, model.n_u
+    q = model.n_u
     A, B, C = form_4_6(model)
     F, Phi, C_bar = free_response(A), toeplitz(A, B, NC), block_diag(*[C] * NP)
     Q_bar, R_bar = block_diag(*[Q] * NP), block_diag(*[R] * NC)
@@ -368,6 +375,7 @@ def incremental_program(c, model, Q, R, limits, S, theta, offset):
 
 
 def test_wang_young_predicts_with_4_8(incremental):
+    """F and Phi."""
     model, Q, R, limits = incremental
     c = wang_young(model, Horizon(NP, NC), Q, R, limits, "preview")
     A, B, C = form_4_6(model)
@@ -378,6 +386,7 @@ def test_wang_young_predicts_with_4_8(incremental):
 
 
 def test_wang_young_program_is_4_10(rng, incremental):
+    """H, p, M and N."""
     model, Q, R, limits = incremental
     c = wang_young(model, Horizon(NP, NC), Q, R, limits, "preview")
     S = rng.standard_normal(NP * model.n_y)
@@ -390,12 +399,13 @@ DISTURBED = [each for each in SIZES if each[2]]
 
 @pytest.mark.parametrize("disturbed", DISTURBED, ids=str)
 def test_direct_disturbances_are_7_5_and_7_6(rng, disturbed):
+    """G and H_v, and the program (7.7)."""
     model = random_model(rng, *disturbed)
-    p, q, r, n, m, lags = disturbed
+    p, q, r, _, _, lags = disturbed
     Q, R = positive(rng, p), positive(rng, q)
     limits = limits_for(rng, p, q)
     c = disturbance_direct(model, Horizon(NP, NC), Q, R, limits, "preview")
-    A, B, C = form_4_6(model)
+    A, _, C = form_4_6(model)
     G = np.zeros((len(A), lags * r))
     for j in range(lags):
         G[:p, j * r : (j + 1) * r] = model.g[j]
