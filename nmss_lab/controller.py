@@ -155,8 +155,8 @@ class Memory:
     ----------
     vector : array (..., n_m)
         Histories, laid out by the form's recipe.
-    decision, known : arrays (..., n_z), (..., n_theta)
-        The last plan, to fall back on.
+    decision, known, multipliers : arrays (..., n_z), (..., n_theta), (..., rows)
+        The last plan, to fall back on and to start the next solve from.
     shift : integer array (...)
         Samples since that plan was made; -1 when there is none.
     refused : bool array (...)
@@ -166,6 +166,7 @@ class Memory:
     vector: Array
     decision: Array
     known: Array
+    multipliers: Array
     shift: Array
     refused: Array
 
@@ -189,8 +190,10 @@ class Move:
         Code of ``Status``.
     cost : array (...)
         Optimal cost J of the sample, in the weights' units.
-    active : bool array (..., rows)
-        Rows of the program held by a limit.
+    multipliers : array (..., rows)
+        Multiplier of each row of the program: positive where an upper limit holds it,
+        negative where a lower one does, zero elsewhere.  One unit more of a limit
+        changes the cost J by twice its multiplier.
     iterations : integer array (...)
     shift : integer array (...)
         Age of the plan in samples: 0 when it was made now.
@@ -203,9 +206,14 @@ class Move:
     known: Array
     status: Array
     cost: Array
-    active: Array
+    multipliers: Array
     iterations: Array
     shift: Array
+
+    @property
+    def active(self) -> Array:
+        """Rows held by a limit, (..., rows) of bool."""
+        return self.multipliers != 0.0
 
     @property
     def sentence(self) -> str:
@@ -238,6 +246,11 @@ class Controller(ABC):
     @property
     def n_theta(self) -> int:
         """Length of the known vector that a memory keeps."""
+        return 0
+
+    @property
+    def n_rows(self) -> int:
+        """Number of limited rows whose multipliers a memory keeps."""
         return 0
 
     @property
@@ -310,7 +323,7 @@ class Controller(ABC):
             vector[layout["estimate"]] = self._estimate_at_rest(y)
         if "integral" in layout and (np.any(y) or np.any(u)):
             vector = self._track(vector, u, np.tile(y, 1 + self.preview))
-        empty = np.zeros(self.n_z), np.zeros(self.n_theta)
+        empty = np.zeros(self.n_z), np.zeros(self.n_theta), np.zeros(self.n_rows)
         return Memory(vector, *empty, np.array(-1), np.array(False))
 
     def measure(
@@ -409,7 +422,14 @@ class Controller(ABC):
         seen = u if seen is None else np.asarray(seen, dtype=float)
         applied = np.concatenate([u, seen, move.governed], axis=-1)
         vector = vector @ recipe.keep.T + applied @ recipe.store.T
-        return Memory(vector, move.decision, move.known, move.shift, memory.refused)
+        return Memory(
+            vector,
+            move.decision,
+            move.known,
+            move.multipliers,
+            move.shift,
+            memory.refused,
+        )
 
     def _overruled(self, memory: Memory, u: Array, move: Move) -> Array:
         """Loops (...) in which the sum of the error must follow the applied input."""

@@ -37,6 +37,7 @@ from nmss_lab.predict import (
 )
 from nmss_lab.qp import (
     Cost,
+    Guess,
     Limit,
     QuadraticProgram,
     Solution,
@@ -112,6 +113,11 @@ class PredictiveController(Controller):
         return self.knowledge.layout.size
 
     @property
+    def n_rows(self) -> int:
+        """Number of limited rows."""
+        return len(self.program.labels)
+
+    @property
     def preview(self) -> int:
         """How many samples of r beyond r_k are read."""
         return self.knowledge.from_r.shape[1] // self.model.n_y - 1
@@ -174,7 +180,7 @@ class PredictiveController(Controller):
             known=theta,
             status=np.full(loops, Status.FREE),
             cost=np.zeros(loops),
-            active=np.zeros((loops, len(self.program.labels)), dtype=bool),
+            multipliers=np.zeros((loops, self.n_rows)),
             iterations=np.zeros(loops, dtype=int),
             shift=np.zeros(loops, dtype=int),
         )
@@ -215,7 +221,12 @@ class PredictiveController(Controller):
         if memory.refused[i]:
             self._continue(move, memory, i, before, Status.REFUSED)
             return
-        solution, status = self._solve(move.known[i], self._reachable(before))
+        guess = memory.decision[i], memory.multipliers[i]
+        solution, status = self._solve(
+            move.known[i],
+            self._reachable(before),
+            guess if memory.shift[i] >= 0 else None,
+        )
         if not solution.found:
             LOG.warning("%s %s", solution.status.value, solution.message)
             self._continue(move, memory, i, before, Status.SHIFTED)
@@ -223,7 +234,7 @@ class PredictiveController(Controller):
         move.decision[i] = solution.decision
         move.u[i] = self.first_move.value(solution.decision, move.known[i])
         move.status[i] = status
-        move.active[i] = solution.active
+        move.multipliers[i] = solution.multipliers
         move.iterations[i] = solution.iterations
 
     def _continue(
@@ -250,12 +261,12 @@ class PredictiveController(Controller):
         return move
 
     def _solve(
-        self, theta: Array, bounds: tuple[Array, Array]
+        self, theta: Array, bounds: tuple[Array, Array], guess: Guess | None
     ) -> tuple[Solution, Status]:
         """Solve with all rows; if that fails let rows give way as the limits say."""
         if self.limits.outputs == "soft" and self._giving.size:
             return self._solve_relaxed(theta, bounds)
-        solution = solve(self.program, theta, self.backend, bounds)
+        solution = solve(self.program, theta, self.backend, bounds, guess)
         if solution.found or not self._giving.size:
             return solution, Status.LIMITED
         if self.limits.outputs == "priority" or (self.ranks == 0).any():

@@ -57,7 +57,7 @@ class StateFeedback(Controller):
             known=np.zeros((loops, 0)),
             status=np.where(memory.refused, Status.HELD, status),
             cost=np.zeros(loops),
-            active=np.zeros((loops, 0), dtype=bool),
+            multipliers=np.zeros((loops, 0)),
             iterations=np.zeros(loops, dtype=int),
             shift=np.full(loops, -1),
         )

@@ -312,14 +312,23 @@ class Solution:
         return np.abs(self.multipliers) > 0.0
 
 
+Guess = tuple[Array, Array]
+"""Decision and multipliers."""
+
+
 class Problem(NamedTuple):
-    """Numbers of one sample: min 1/2 z'Hz + f'z, lower <= M z <= upper."""
+    """Numbers of one sample: min 1/2 z'Hz + f'z, lower <= M z <= upper.
+
+    ``guess`` holds the decision and multipliers to start from, for solvers that can be
+    warm-started.
+    """
 
     H: Array
     f: Array
     M: Array
     lower: Array
     upper: Array
+    guess: Guess | None = None
 
 
 Answer = tuple[Array | None, Array, int, bool]
@@ -333,6 +342,7 @@ def solve(
     theta: Array,
     backend: str = "daqp",
     bounds: tuple[Array, Array] | None = None,
+    guess: Guess | None = None,
 ) -> Solution:
     """Solve the program for one known vector.
 
@@ -344,6 +354,9 @@ def solve(
         "daqp", "proxqp", or "qpsolvers/NAME" for any solver qpsolvers finds.
     bounds : pair of arrays (rows,), optional
         Lower and upper limits in place of the program's.
+    guess : pair of arrays (at most n_z,), (rows,), optional
+        Decision and multipliers to start from, such as the last sample's; missing
+        entries of the decision are zero.
 
     Returns
     -------
@@ -358,8 +371,10 @@ def solve(
     solver = find_backend(backend)
     low, high = bounds or (program.lower, program.upper)
     known = program.offset @ theta
+    if guess is not None:
+        guess = np.pad(guess[0], (0, program.n_z - len(guess[0]))), guess[1]
     problem = Problem(
-        program.H, program.f @ theta, program.M, low - known, high - known
+        program.H, program.f @ theta, program.M, low - known, high - known, guess
     )
     nothing = np.zeros(program.n_z), np.zeros(len(known))
     try:
@@ -452,7 +467,11 @@ def _proxqp(problem: Problem) -> Answer:
     qp.settings.eps_duality_gap_rel = 1e-9
     qp.settings.max_iter = 10_000
     qp.init(problem.H, problem.f, None, None, problem.M, problem.lower, problem.upper)
-    qp.solve()
+    if problem.guess is None:
+        qp.solve()
+    else:
+        qp.settings.initial_guess = proxsuite.proxqp.InitialGuess.WARM_START
+        qp.solve(problem.guess[0], None, problem.guess[1])
     results, status = qp.results, proxsuite.proxqp
     infeasible = results.info.status == status.PROXQP_PRIMAL_INFEASIBLE
     return results.x.copy(), results.z.copy(), int(results.info.iter), bool(infeasible)

@@ -112,8 +112,9 @@ class Run:
     status : integer array (N,)
         Codes of ``Status``.
     cost : array (N,)
-    active : bool array (N, rows)
-        Rows of the controller's program held by a limit.
+    multipliers : array (N, rows)
+        Of the rows of the controller's program, see ``Move``; zero where no limit
+        holds.
     iterations : integer array (N,)
     moves : Move, optional
         All decisions, one row a sample: ``trail`` reads predictions from them.
@@ -132,7 +133,7 @@ class Run:
     v: Array
     status: Array
     cost: Array
-    active: Array
+    multipliers: Array
     iterations: Array
     t_fine: Array
     y_fine: Array
@@ -141,6 +142,11 @@ class Run:
     def __len__(self) -> int:
         """Return the number of samples."""
         return len(self.t)
+
+    @property
+    def active(self) -> Array:
+        """Rows of the controller's program held by a limit, (N, rows) of bool."""
+        return self.multipliers != 0.0
 
     def trail(self, name: str) -> Array:
         """Predictions made at every sample: (N, Np, channels).
@@ -431,7 +437,7 @@ def _collect(
             v,
             moves.status[i],
             moves.cost[i],
-            moves.active[i],
+            moves.multipliers[i],
             moves.iterations[i],
             t_fine,
             y_fine[i],
