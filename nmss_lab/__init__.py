@@ -14,7 +14,6 @@ from nmss_lab.governor import governor
 from nmss_lab.models import DifferenceModel, LinearPlant, Plant
 from nmss_lab.mpc import (
     STRUCTURES,
-    PredictiveController,
     disturbance_augmented,
     disturbance_direct,
     forward_path,
@@ -25,6 +24,7 @@ from nmss_lab.mpc import (
 )
 from nmss_lab.pip import lq_gain, pip, pole_gain
 from nmss_lab.predict import Horizon
+from nmss_lab.predictive import PredictiveController
 from nmss_lab.records import Record
 from nmss_lab.simulate import Run, Scenario, closed_loop, closed_loops, samples
 

@@ -25,7 +25,7 @@ from nmss_lab.models import (
     minimal_realisation,
     sort_by_size,
 )
-from nmss_lab.mpc import PredictiveController
+from nmss_lab.predictive import PredictiveController
 
 Transfer = Literal["T", "S_i", "S_o"]
 

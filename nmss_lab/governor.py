@@ -15,7 +15,6 @@ import numpy as np
 
 from nmss_lab.controller import Limits, Memory, Move
 from nmss_lab.models import Array, DifferenceModel, Numbers
-from nmss_lab.mpc import Knowledge, PredictiveController, limit
 from nmss_lab.nmss import Layout, integral_of_error_form
 from nmss_lab.pip import gain
 from nmss_lab.predict import (
@@ -27,6 +26,7 @@ from nmss_lab.predict import (
     predict,
     stack,
 )
+from nmss_lab.predictive import Knowledge, PredictiveController, limit
 from nmss_lab.qp import Cost, assemble, find_backend
 
 

@@ -1,4 +1,4 @@
-"""Predictive controllers: one class, and one short function for each structure.
+"""The predictive structures of the thesis, one short function each.
 
 A structure says what its state is, what drives the model along the horizon, what is
 weighed and what is limited (the table of the design document); everything else is
@@ -7,16 +7,13 @@ shared.
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Callable
 from typing import Any, Literal
 
 import numpy as np
 import scipy.linalg
 
-from nmss_lab.controller import Controller, Limits, Memory, Move, Status
+from nmss_lab.controller import Limits
 from nmss_lab.models import Array, DifferenceModel
 from nmss_lab.nmss import (
     Form,
@@ -35,328 +32,20 @@ from nmss_lab.predict import (
     known_part,
     predict,
 )
-from nmss_lab.qp import (
-    Cost,
-    Guess,
-    Limit,
-    QuadraticProgram,
-    Solution,
-    assemble,
-    find_backend,
-    solve,
-    weight,
+from nmss_lab.predictive import (
+    Forecast,
+    Knowledge,
+    PredictiveController,
+    limit,
+    output_ranks,
 )
-
-LOG = logging.getLogger(__name__)
+from nmss_lab.qp import Cost, Limit, assemble, find_backend, weight
 
 Reading = Literal["held", "next", "preview", "zero"]
 """What S holds: r_k repeated, r_{k+1} repeated, the true future, or nothing (the
 reference then enters through the sum of the error alone, as in PIP control)."""
 
-Forecast = Literal["held", "given"] | Callable[[Array, int], Array]
-"""Measured disturbances ahead: v_k held, handed to ``decide``, or a function of the
-latest values (ng + 1, n_v), v_k first, and of the number of samples ahead that
-returns (samples, n_v)."""
-
 Terminal = Literal["none", "equality", "lq"]
-
-
-@dataclass(frozen=True, eq=False)
-class Knowledge:
-    """Layout of the known vector theta and how it is made.
-
-    theta = from_memory m + from_r [r_k; r_{k+1}; ...] + from_v [v_k; v_{k+1}; ...]
-    """
-
-    layout: Layout
-    from_memory: Array
-    from_r: Array
-    from_v: Array
-
-
-@dataclass(frozen=True, eq=False)
-class PredictiveController(Controller):
-    """A design that decides by a quadratic program; frozen, and shared by many loops.
-
-    Parameters
-    ----------
-    model, form, limits : see ``Controller``
-    horizon : Horizon
-    program : QuadraticProgram
-    signals : mapping of str to Affine
-        Predicted "u" (Np n_u), "du" (Np n_u), "y" (Np n_y), and "w" and "beta" under
-        a governor.
-    knowledge : Knowledge
-    ranks : integer array (rows,)
-        Order in which rows give way when not all can be kept, the highest first;
-        -1 for rows that never do.
-    backend : str
-    forecast : "held", "given" or a function, see ``Forecast``
-    """
-
-    horizon: Horizon
-    program: QuadraticProgram
-    signals: Mapping[str, Affine]
-    knowledge: Knowledge
-    ranks: Array
-    backend: str = "daqp"
-    forecast: Forecast = "held"
-
-    @property
-    def n_z(self) -> int:
-        """Number of decision variables."""
-        return self.program.n_z
-
-    @property
-    def n_theta(self) -> int:
-        """Size of the known vector."""
-        return self.knowledge.layout.size
-
-    @property
-    def n_rows(self) -> int:
-        """Number of limited rows."""
-        return len(self.program.labels)
-
-    @property
-    def preview(self) -> int:
-        """How many samples of r beyond r_k are read."""
-        return self.knowledge.from_r.shape[1] // self.model.n_y - 1
-
-    @property
-    def forecast_steps(self) -> int:
-        """How many samples of v beyond v_k are read."""
-        return max(self.knowledge.from_v.shape[1] // max(self.model.n_v, 1) - 1, 0)
-
-    @cached_property
-    def first_move(self) -> Affine:
-        """u_k as a function of decision and known vector."""
-        return self.signals["u"][: self.model.n_u]
-
-    @cached_property
-    def free_gain(self) -> Array:
-        """Gain (n_u, n_theta) of u_k on the known vector without active limits."""
-        free: Array = self.first_move.gain @ self.program.free + self.first_move.known
-        return free
-
-    def gain(self, name: str) -> Array:
-        """Gain of the law u_k = ... - gain @ part, for a part of the known vector.
-
-        ``gain("x")`` is the first block row of K_s and ``gain("r")`` that of R_s in
-        (4.17); for structures on changes the law adds u_{k-1} and ``-gain("r")`` is
-        w_s of (6.3).
-        """
-        part: Array = -self.free_gain[:, self.knowledge.layout[name]]
-        return part
-
-    def free_law(self) -> tuple[Array, Array]:
-        """First move without limits: gains on the memory and on r_k, r_{k+1}, ..."""
-        knows = self.knowledge
-        return self.free_gain @ knows.from_memory, self.free_gain @ knows.from_r
-
-    def plan(self, move: Move, name: str) -> Array:
-        """Predicted signal ("u", "du", "y", ...) of a move, (..., Np, channels).
-
-        A plan that was continued after a failure is shifted to the present sample,
-        its last value repeated.
-        """
-        flat = self.signals[name].value(move.decision, move.known)
-        steps = self.signals[name].gain.shape[0]
-        width = steps // self.horizon.Np
-        plan = flat.reshape(*flat.shape[:-1], self.horizon.Np, width)
-        shift = np.maximum(np.asarray(move.shift), 0)[..., None]
-        step = np.minimum(np.arange(self.horizon.Np) + shift, self.horizon.Np - 1)
-        return np.take_along_axis(plan, step[..., None], axis=-2)
-
-    def _decide(self, memory: Memory, r: Array, v: Array) -> Move:
-        theta = self._known(memory.vector, r, v)
-        z = theta @ self.program.free.T
-        kept = (self.program.room(z, theta) >= -self.program.slack).all(axis=-1)
-        loops = len(theta)
-        move = Move(
-            u=self.first_move.value(z, theta),
-            w=r[:, 0].copy(),
-            governed=r[:, 0].copy(),
-            decision=z,
-            known=theta,
-            status=np.full(loops, Status.FREE),
-            cost=np.zeros(loops),
-            multipliers=np.zeros((loops, self.n_rows)),
-            iterations=np.zeros(loops, dtype=int),
-            shift=np.zeros(loops, dtype=int),
-        )
-        for i in np.flatnonzero(~kept | memory.refused).tolist():
-            self._decide_limited(move, memory, i)
-        return self._finish(move, memory)
-
-    def _known(self, vector: Array, r: Array, v: Array) -> Array:
-        knows, loops = self.knowledge, len(vector)
-        theta: Array = vector @ knows.from_memory.T
-        if knows.from_r.any():
-            theta += r.reshape(loops, -1) @ knows.from_r.T
-        if knows.from_v.any():
-            if callable(self.forecast):
-                v = self._ask_forecast(self.forecast, vector)
-            theta += v.reshape(loops, -1) @ knows.from_v.T
-        return theta
-
-    def _ask_forecast(
-        self, forecast: Callable[[Array, int], Array], vector: Array
-    ) -> Array:
-        """v_k, v_{k+1}, ... of every loop, (loops, 1 + forecast_steps, n_v)."""
-        latest = self.form.recipe.layout.read(vector, "v")
-        steps = self.forecast_steps
-        ahead = np.array([np.asarray(forecast(v, steps), float) for v in latest])
-        if ahead.shape != (len(vector), steps, self.model.n_v):
-            raise ValueError(
-                f"forecast returned shape {ahead.shape[1:]}, expected "
-                f"({steps}, {self.model.n_v})"
-            )
-        if not np.isfinite(ahead).all():
-            raise ValueError("forecast returned values that are not finite")
-        return np.concatenate([latest[:, :1], ahead], axis=1)
-
-    def _decide_limited(self, move: Move, memory: Memory, i: int) -> None:
-        """Fill in row i, where the free optimum breaks a limit or cannot be had."""
-        before = self.last_input(memory.vector[i])
-        if memory.refused[i]:
-            self._continue(move, memory, i, before, Status.REFUSED)
-            return
-        guess = memory.decision[i], memory.multipliers[i]
-        solution, status = self._solve(
-            move.known[i],
-            self._reachable(before),
-            guess if memory.shift[i] >= 0 else None,
-        )
-        if not solution.found:
-            LOG.warning("%s %s", solution.status.value, solution.message)
-            self._continue(move, memory, i, before, Status.SHIFTED)
-            return
-        move.decision[i] = solution.decision
-        move.u[i] = self.first_move.value(solution.decision, move.known[i])
-        move.status[i] = status
-        move.multipliers[i] = solution.multipliers
-        move.iterations[i] = solution.iterations
-
-    def _continue(
-        self, move: Move, memory: Memory, i: int, before: Array, status: Status
-    ) -> None:
-        """Fall back on the last plan, or hold the input where there is none."""
-        if memory.shift[i] < 0:
-            move.decision[i] = 0.0
-            move.u[i], move.status[i], move.shift[i] = before, Status.HELD, -1
-            return
-        move.decision[i], move.known[i] = memory.decision[i], memory.known[i]
-        move.shift[i], move.status[i] = memory.shift[i] + 1, status
-        step = min(int(move.shift[i]), self.horizon.Np - 1)
-        u = self.signals["u"].value(move.decision[i], move.known[i])
-        move.u[i] = u.reshape(self.horizon.Np, -1)[step]
-
-    def _finish(self, move: Move, memory: Memory) -> Move:
-        """Apply the input's limits once more and state the cost."""
-        clipped = self.clip(move.u, self.last_input(memory.vector))
-        cut = np.abs(clipped - move.u).max(axis=-1) > 1e-6
-        move.status[cut & (move.status < Status.CLIPPED)] = Status.CLIPPED
-        move.u[:] = clipped
-        move.cost[:] = self.program.cost(move.decision, move.known)
-        return move
-
-    def _solve(
-        self, theta: Array, bounds: tuple[Array, Array], guess: Guess | None
-    ) -> tuple[Solution, Status]:
-        """Solve with all rows; if that fails let rows give way as the limits say."""
-        if self.limits.outputs == "soft" and self._giving.size:
-            return self._solve_relaxed(theta, bounds)
-        solution = solve(self.program, theta, self.backend, bounds, guess)
-        if solution.found or not self._giving.size:
-            return solution, Status.LIMITED
-        if self.limits.outputs == "priority" or (self.ranks == 0).any():
-            return self._solve_by_rank(theta, bounds)
-        return self._solve_without(theta, bounds)
-
-    @cached_property
-    def _giving(self) -> Array:
-        return np.flatnonzero(self.ranks >= 0)
-
-    @cached_property
-    def _without_outputs(self) -> QuadraticProgram:
-        names = {self.program.labels[i].name for i in self._giving}
-        return self.program.without(*names)
-
-    def _solve_without(
-        self, theta: Array, bounds: tuple[Array, Array]
-    ) -> tuple[Solution, Status]:
-        """Drop the rows that may give way (6.1.2)."""
-        keep = self.ranks < 0
-        low, high = bounds
-        solution = solve(
-            self._without_outputs, theta, self.backend, (low[keep], high[keep])
-        )
-        multipliers = np.zeros(len(keep))
-        multipliers[keep] = solution.multipliers
-        return _cut(solution, self.n_z, multipliers), Status.DROPPED
-
-    @cached_property
-    def _relaxed(self) -> QuadraticProgram:
-        weight = np.full(self._giving.size, self.limits.soft_weight)
-        return self.program.softened(self._giving, weight)
-
-    def _solve_relaxed(
-        self, theta: Array, bounds: tuple[Array, Array]
-    ) -> tuple[Solution, Status]:
-        """Pay a quadratic price for breaking output limits."""
-        solution = solve(self._relaxed, theta, self.backend, bounds)
-        broken = np.abs(solution.decision[self.n_z :]).max(initial=0.0) > 1e-6
-        status = Status.SOFTENED if broken else Status.LIMITED
-        return _cut(solution, self.n_z, solution.multipliers), status
-
-    def _solve_by_rank(
-        self, theta: Array, bounds: tuple[Array, Array]
-    ) -> tuple[Solution, Status]:
-        """Break each rank of rows as little as the more important ones allow."""
-        low, high = bounds[0].copy(), bounds[1].copy()
-        for rank in np.unique(self.ranks[self._giving]):
-            rows = np.flatnonzero(self.ranks == rank)
-            later = self.ranks > rank
-            free = np.where(later, -np.inf, low), np.where(later, np.inf, high)
-            weight = np.full(rows.size, 1e6 * np.abs(self.program.H).max())
-            program = self.program.softened(rows, weight)
-            solution = solve(program, theta, self.backend, free)
-            if not solution.found:
-                return solution, Status.SHIFTED
-            missed = np.abs(solution.decision[self.n_z :]) + 1e-7
-            low[rows], high[rows] = low[rows] - missed, high[rows] + missed
-        solution = solve(self.program, theta, self.backend, (low, high))
-        return solution, Status.SOFTENED
-
-    def _reachable(self, before: Array) -> tuple[Array, Array]:
-        """Bounds of the rows, level limits widened to what the rates can reach."""
-        low, high = self.program.lower, self.program.upper
-        if ((before >= self.limits_u[0]) & (before <= self.limits_u[1])).all():
-            return low, high
-        low, high = low.copy(), high.copy()
-        for row, (name, channel, step) in enumerate(self.program.labels):
-            if name == "u":
-                moves = 1 + np.searchsorted(self._move_steps, step)
-                slowest, fastest = (side[channel] for side in self.limits_du)
-                high[row] = max(high[row], before[channel] + moves * slowest)
-                low[row] = min(low[row], before[channel] + moves * fastest)
-        return low, high
-
-    @cached_property
-    def _move_steps(self) -> Array:
-        return np.unique([row.step for row in self.program.labels if row.name == "u"])
-
-
-def _cut(solution: Solution, n_z: int, multipliers: Array) -> Solution:
-    """Solution without slack variables and with multipliers for the original rows."""
-    return Solution(
-        solution.decision[:n_z],
-        multipliers,
-        solution.status,
-        solution.iterations,
-        solution.residual,
-        solution.message,
-    )
 
 
 def integral_of_error(
@@ -761,30 +450,6 @@ class _Setup:
             changes -= np.eye(self._ahead * r, from_v.shape[1])
             from_v[known["dv_ahead"]] = changes
         return Knowledge(known, from_memory, from_r, from_v)
-
-
-def limit(name: str, signal: Affine, sides: tuple[Array, Array], steps: Array) -> Limit:
-    """Limit with the same sides (n,) at each of the steps."""
-    low, high = sides
-    return Limit(
-        name,
-        signal,
-        np.tile(low, len(steps)),
-        np.tile(high, len(steps)),
-        len(low),
-        steps,
-    )
-
-
-def output_ranks(program: QuadraticProgram, limits: Limits, n_y: int) -> Array:
-    """Order in which output and terminal rows give way; -1 for input rows."""
-    ranks = limits.ranks(n_y)
-    last = int(ranks.max()) + 1
-    order = {"y": lambda row: int(ranks[row.channel]), "terminal": lambda row: last}
-    return np.array(
-        [order[row.name](row) if row.name in order else -1 for row in program.labels],
-        dtype=int,
-    )
 
 
 def state_weight(

@@ -10,7 +10,7 @@ import numpy as np
 
 from nmss_lab.controller import Controller, Memory, Move, Status
 from nmss_lab.models import Array, LinearPlant, Numbers, Plant
-from nmss_lab.mpc import PredictiveController
+from nmss_lab.predictive import PredictiveController
 
 
 @dataclass(frozen=True, eq=False)

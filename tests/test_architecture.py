@@ -20,6 +20,7 @@ ORDER = [
     "qp",
     "controller",
     "pip",
+    "predictive",
     "mpc",
     "governor",
     "analysis",

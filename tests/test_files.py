@@ -7,7 +7,7 @@ import pytest
 
 from nmss_lab import Design, DifferenceModel, Horizon, Limits, Record, Scenario
 from nmss_lab.files import Study, dumps, load, loads, save
-from nmss_lab.mpc import PredictiveController
+from nmss_lab.predictive import PredictiveController
 from nmss_lab.simulate import closed_loop
 
 
