@@ -1,0 +1,167 @@
+// A form made from a description: sliders, selections, and a reset.
+// Values go to the server one at a time: the next leaves when the last is answered,
+// so that the latest value wins and nothing queues.
+
+const element = (tag, attributes = {}, ...children) => {
+  const node = document.createElement(tag)
+  for (const [name, value] of Object.entries(attributes)) node.setAttribute(name, value)
+  node.append(...children)
+  return node
+}
+
+const shown = (value) => {
+  if (!Number.isFinite(value)) return String(value)
+  const text = Number(value.toPrecision(4)).toString()
+  return text.replace("-", "\u2212")
+}
+
+const same = (a, b) => JSON.stringify(a) === JSON.stringify(b)
+
+export function render({ model, el }) {
+  let values = {}
+  let waiting = null   // number of the message that is not answered yet
+  let changed = false  // whether values changed since it was sent
+  let sent = 0
+  let address = 0
+  const open = {}
+  const update = {}    // name -> function that shows a value
+  const form = element("form", { class: "controls", "aria-label": "Choices" })
+  form.addEventListener("submit", (event) => event.preventDefault())
+  el.append(form)
+
+  const send = () => {
+    if (waiting !== null) { changed = true; return }
+    changed = false
+    waiting = ++sent
+    model.sent = { ...values, message: waiting }
+  }
+
+  const choose = (name, value) => {
+    values[name] = value
+    if (update[name]) update[name](value)
+    send()
+    clearTimeout(address)
+    address = setTimeout(writeAddress, 250)
+  }
+
+  const writeAddress = () => {
+    const query = new URLSearchParams()
+    const defaults = model.state.defaults
+    for (const [name, value] of Object.entries(values)) {
+      if (!same(value, defaults[name])) query.set(name, value)
+    }
+    const text = query.toString()
+    history.replaceState(null, "", location.pathname + (text ? "?" + text : ""))
+  }
+
+  const slider = (item, id) => {
+    const log = item.kind === "log"
+    const to = log ? Math.log10 : (x) => x
+    const back = log ? (x) => Number((10 ** x).toPrecision(3)) : Number
+    const input = element("input", {
+      type: "range", id, name: item.name, "aria-describedby": id + "-help",
+      min: to(item.low), max: to(item.high),
+      step: log ? 0.02 : item.step ?? (item.high - item.low) / 100,
+    })
+    const output = element("output", { for: id })
+    const put = (value) => {
+      input.value = to(value)
+      output.textContent = shown(value)
+      input.setAttribute("aria-valuetext", shown(value))
+      const share = (to(value) - to(item.low)) / (to(item.high) - to(item.low))
+      input.style.setProperty("--share", `${100 * share}%`)
+    }
+    input.addEventListener("input", () => choose(item.name, back(Number(input.value))))
+    update[item.name] = put
+    return [element("label", { for: id }, item.label), output, input]
+  }
+
+  const select = (item, id) => {
+    const input = element("select", {
+      id, name: item.name, "aria-describedby": id + "-help",
+    })
+    for (const [value, text] of item.options) {
+      const option = element("option", { value: JSON.stringify(value) })
+      option.textContent = text
+      input.append(option)
+    }
+    update[item.name] = (value) => { input.value = JSON.stringify(value) }
+    input.addEventListener("change", () => choose(item.name, JSON.parse(input.value)))
+    return [element("label", { for: id }, item.label), input]
+  }
+
+  const several = (item, id) => {
+    const group = element("fieldset", { "aria-describedby": id + "-help" })
+    group.append(element("legend", {}, item.label))
+    const boxes = item.options.map(([value, text]) => {
+      const box = element("input", { type: "checkbox", name: item.name, value })
+      box.addEventListener("change", () => {
+        const others = values[item.name].filter((other) => other !== value)
+        choose(item.name, box.checked ? [...others, value] : others)
+      })
+      const mark = element("span", { class: "swatch", "aria-hidden": "true" })
+      group.append(element("label", { class: "check" }, box, mark, text))
+      return [box, mark]
+    })
+    update[item.name] = (chosen) => {
+      for (const [box, mark] of boxes) {
+        const place = chosen.indexOf(box.value)
+        box.checked = place >= 0
+        box.disabled = place < 0 && chosen.length >= item.most
+          || place >= 0 && chosen.length === 1
+        mark.className = place >= 0 ? `swatch style${place}` : "swatch"
+      }
+    }
+    return [group]
+  }
+
+  const build = () => {
+    const focused = form.getRootNode().activeElement?.name
+    for (const part of form.querySelectorAll("details")) {
+      open[part.dataset.title] = part.open
+    }
+    form.replaceChildren()
+    for (const name of Object.keys(update)) delete update[name]
+    for (const [number, group] of model.state.groups.entries()) {
+      const part = element("details", {})
+      part.dataset.title = group.title
+      part.open = open[group.title] ?? true
+      part.append(element("summary", {}, group.title))
+      for (const item of group.items) {
+        const id = `choice-${item.name}`
+        const make = { one: select, several }[item.kind] ?? slider
+        const kind = { one: "one", several: "several" }[item.kind] ?? "slider"
+        const help = element("p", { id: id + "-help", class: "help" })
+        help.textContent = item.help
+        part.append(element("div", { class: `choice ${kind}` }, ...make(item, id), help))
+      }
+      form.append(part)
+    }
+    const reset = element("button", { type: "button", class: "wide" }, "Reset all choices")
+    reset.addEventListener("click", () => choose("reset", true))
+    form.append(reset)
+    take()
+    if (focused) form.querySelector(`[name="${focused}"]`)?.focus()
+  }
+
+  const take = () => {
+    values = { ...model.state.values }
+    for (const [name, show] of Object.entries(update)) show(values[name])
+    for (const key of ["u", "du", "y"]) {
+      const own = form.querySelector(`[name="${key}_max"]`)
+      own?.closest(".choice").classList.toggle("idle", values[`limit_${key}`] !== "own")
+    }
+  }
+
+  let description = JSON.stringify(model.state.groups)
+  model.on("state", () => {
+    const answer = model.state.message
+    if (waiting !== null && answer < waiting) return
+    waiting = null
+    if (changed) { send(); return }
+    const next = JSON.stringify(model.state.groups)
+    if (next !== description) { description = next; build() } else take()
+    writeAddress()
+  })
+  build()
+}

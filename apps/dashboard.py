@@ -1,0 +1,40 @@
+"""Entry point of the live pages: which there are, and the index of them."""
+
+from collections.abc import Callable
+
+import panel as pn
+from panel.viewable import Viewable
+
+from apps.pages import governor, receding_horizon
+from apps.pages.live import page_template, text_style
+
+INDEX = """
+<h1>Predictive control, live</h1>
+<p>Every plot answers while you move a slider, and every run can be played: see the
+controller plan, act, and plan again.</p>
+<div class="cards">
+<a class="card" href="receding_horizon"><b>Receding horizon</b>
+Up to three control structures side by side on the worked examples, with limits,
+disturbances, and a plant that differs from its model.</a>
+<a class="card" href="governor"><b>Reference governor</b>
+One loop with and without a governor that bends the reference just enough to keep
+every limit.</a>
+</div>
+"""
+
+
+def index() -> pn.Template:
+    """Build the page that leads to the others."""
+    page = page_template("", "Predictive control in the non-minimal state space")
+    text = pn.pane.HTML(INDEX, stylesheets=[text_style()], sizing_mode="stretch_width")
+    page.add_panel("index", text)
+    return page
+
+
+def pages() -> dict[str, Callable[[], Viewable]]:
+    """Builders of all pages by path; the empty path is the index."""
+    return {
+        "": index,
+        "receding_horizon": receding_horizon.page,
+        "governor": governor.page,
+    }

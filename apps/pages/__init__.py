@@ -1,0 +1,1 @@
+"""One module a page: which choices, which charts, what to look at."""

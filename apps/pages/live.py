@@ -1,0 +1,250 @@
+"""What the live pages share: choices in, runs computed, figures and tables shown."""
+
+from __future__ import annotations
+
+import html
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import jinja2
+import panel as pn
+from bokeh.models import Range1d
+
+from apps.player import Controls, Player, moving
+from apps.session import Choices, plain
+from nmss_lab.measures import table
+from nmss_lab.plots import Chart, ChartFigure, busiest_sample
+from nmss_lab.simulate import Run
+
+HERE = Path(__file__).resolve().parent.parent
+PAGES = (("receding_horizon", "Receding horizon"), ("governor", "Reference governor"))
+
+COLUMNS = {
+    "rise": "Rise [s]",
+    "settling": "Settling [s]",
+    "overshoot": "Overshoot [%]",
+    "IAE": "IAE",
+    "ISE": "ISE",
+    "coupling": "Coupling",
+    "RMS du": "RMS of du",
+    "violations": "Samples outside limits",
+}
+
+
+@dataclass(frozen=True)
+class Subject:
+    """What makes one page: its choices, its charts, and words about each case.
+
+    Parameters
+    ----------
+    path, heading : str
+    choices : type of Choices
+    charts : function of (runs, output, input)
+    look : mapping from a case to one sentence: what to look at
+    """
+
+    path: str
+    heading: str
+    choices: type[Choices]
+    charts: Callable[[Mapping[str, Run], int, int], list[Chart]]
+    look: Mapping[str, str]
+
+
+class LivePage:
+    """One session's page: keeps the last good picture whatever is chosen."""
+
+    def __init__(self, subject: Subject) -> None:
+        self.subject = subject
+        self.choices = subject.choices()
+        self.complaint = _from_address(self.choices)
+        self.lead, self.alert, self.measures, self.python, self.notes = (
+            _text(name) for name in ("lead", "alert", "measures", "python", "notes")
+        )
+        self.runs, charts = self._first_picture()
+        times = Range1d(*charts[0].span)
+        self.figures = {chart.name: ChartFigure(chart, times) for chart in charts}
+        start = busiest_sample(self.runs)
+        self.player = Player(run=moving(charts, self._named(), start, True))
+        self.controls = Controls(state=self._state(0))
+        self.controls.param.watch(self._take, "sent")
+        self._tell()
+
+    def _first_picture(self) -> tuple[dict[str, Run], list[Chart]]:
+        """Runs of the choices, or of the defaults where those cannot be had."""
+        try:
+            return self._compute()
+        except ValueError as error:
+            self.complaint = self.complaint or str(error)
+            chosen, self.choices = self.choices, self.subject.choices()
+            picture = self._compute()
+            self.choices = chosen
+            return picture
+
+    def _compute(self) -> tuple[dict[str, Run], list[Chart]]:
+        runs = self.choices.runs()
+        named = {plain(name): run for name, run in runs.items()}
+        shown = self.choices.output, self.choices.input
+        return runs, self.subject.charts(named, *shown)
+
+    def _named(self) -> dict[str, Run]:
+        return {plain(name): run for name, run in self.runs.items()}
+
+    def _take(self, event: Any) -> None:
+        """Take over what the form sent, compute, show, and answer."""
+        sent = dict(event.new)
+        message, case = sent.pop("message", 0), self.choices.case
+        try:
+            self._accept(sent)
+            self.runs, charts = self._compute()
+            self.complaint = ""
+        except ValueError as error:
+            self.complaint, charts = str(error), []
+        if charts:
+            self._show(charts, fresh=self.choices.case != case)
+        self._tell()
+        self.controls.state = self._state(message)
+
+    def _accept(self, sent: dict[str, Any]) -> None:
+        if sent.pop("reset", False):
+            self.choices.take_case(self.subject.choices.default_case)
+        elif sent.get("case") != self.choices.case:
+            self.choices.accept({"case": sent.get("case")})
+        else:
+            self.choices.accept(sent)
+
+    def _show(self, charts: Sequence[Chart], fresh: bool) -> None:
+        for chart in charts:
+            self.figures[chart.name].show(chart)
+        start = busiest_sample(self.runs)
+        self.player.run = moving(charts, self._named(), start, fresh)
+
+    def _state(self, message: int) -> dict[str, Any]:
+        choices = self.choices
+        return {
+            "groups": choices.description(),
+            "values": choices.values(),
+            "defaults": choices.defaults(),
+            "message": message,
+        }
+
+    def _tell(self) -> None:
+        """Words around the plots."""
+        example, look = self.choices.example, self.subject.look
+        self.lead.object = _paragraph(look.get(example.name, example.title + "."))
+        self.alert.object = _complaint(self.complaint)
+        if not self.complaint:
+            self.measures.object = _measures(self._named(), self.choices.output)
+            self.python.object = f"<pre>{html.escape(self.choices.script())}</pre>"
+        notes = "".join(f"<li>{html.escape(note)}</li>" for note in example.notes)
+        source = html.escape(f"Section {example.section}. {example.source}.")
+        self.notes.object = f"<p>{source}</p><ul>{notes}</ul>"
+
+    def template(self) -> pn.Template:
+        """The page, ready to be served."""
+        page = page_template(
+            self.subject.path, self.subject.heading, list(self.figures)
+        )
+        for name in (
+            "lead",
+            "alert",
+            "player",
+            "measures",
+            "python",
+            "notes",
+            "controls",
+        ):
+            page.add_panel(name, getattr(self, name))
+        for name, drawn in self.figures.items():
+            pane = pn.pane.Bokeh(drawn.figure, sizing_mode="stretch_both")
+            page.add_panel(name, pane)
+        return page
+
+
+def live_page(subject: Subject) -> pn.Template:
+    """Build the page for a new session."""
+    return LivePage(subject).template()
+
+
+def page_template(path: str, heading: str, charts: Sequence[str] = ()) -> pn.Template:
+    """Build the frame of a page; panels are added by name."""
+    page = pn.Template(_page_source())
+    page.title = f"{heading} - NMSS Lab"
+    page.add_variable("page_style", (HERE / "page.css").read_text(encoding="utf-8"))
+    page.add_variable("pages", PAGES)
+    page.add_variable("here", path)
+    page.add_variable("heading", heading)
+    page.add_variable("charts", list(charts))
+    return page
+
+
+@cache
+def _page_source() -> jinja2.Template:
+    source = (HERE / "page.html").read_text(encoding="utf-8")
+    template: jinja2.Template = pn.io.resources._env.from_string(source)
+    return template
+
+
+@cache
+def text_style() -> str:
+    """Style sheet of texts."""
+    return (HERE / "texts.css").read_text(encoding="utf-8")
+
+
+def _text(name: str) -> pn.pane.HTML:
+    return pn.pane.HTML(
+        "",
+        stylesheets=[text_style()],
+        sizing_mode="stretch_width",
+        margin=0,
+        css_classes=[f"text-{name}"],
+    )
+
+
+def _from_address(choices: Choices) -> str:
+    """Take the choices in the page's address; return what is wrong with them."""
+    arguments = pn.state.session_args or {}
+    given = {key: values[0].decode() for key, values in arguments.items()}
+    try:
+        choices.accept(given)
+    except ValueError as error:
+        return f"In the address of this page: {error}"
+    return ""
+
+
+def _paragraph(text: str) -> str:
+    return f"<p>{html.escape(text)}</p>"
+
+
+def _complaint(text: str) -> str:
+    if not text:
+        return ""
+    kept = "The picture still shows the last choices that worked."
+    return f'<div class="wrong"><p>{html.escape(text)}</p><p class="quiet">{kept}</p></div>'
+
+
+def _measures(runs: Mapping[str, Run], channel: int) -> str:
+    """Table of measures, one row a run."""
+    rows = table(runs, channel)
+    head = "".join(f"<th>{html.escape(text)}</th>" for text in COLUMNS.values())
+    body = "".join(
+        f'<tr><th scope="row"><span class="swatch style{number}"></span>'
+        f"{html.escape(str(row['run']))}</th>"
+        + "".join(f"<td>{_number(row[key])}</td>" for key in COLUMNS)
+        + "</tr>"
+        for number, row in enumerate(rows)
+    )
+    caption = (
+        "First step of the reference for rise, settling and overshoot; whole run else"
+    )
+    return (
+        f"<table><caption>{caption}</caption><thead><tr><th>Run</th>{head}</tr></thead>"
+        f"<tbody>{body}</tbody></table>"
+    )
+
+
+def _number(value: Any) -> str:
+    return "\u2013" if math.isnan(value) else f"{value:.4g}".replace("-", "\u2212")

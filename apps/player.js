@@ -1,0 +1,333 @@
+// Plays a run that was sent once. Static curves are Bokeh's; this draws, on a canvas
+// between Bokeh's curves and its limits, what moves: the curtain over the future, the
+// plan of the present sample, and the fan of past plans. It knows nothing of control.
+
+const COLORS = ["#0072B2", "#D55E00", "#009E73"]
+const ICONS = {
+  first: "M5 5v14M19 5 9 12l10 7z",
+  back: "M8 5v14M18 5l-8 7 8 7z",
+  play: "M7 4.5v15l13-7.5z",
+  pause: "M8 5v14M16 5v14",
+  forward: "M16 5v14M6 5l8 7-8 7z",
+  last: "M19 5v14M5 5l10 7-10 7z",
+}
+
+const element = (tag, attributes = {}, ...children) => {
+  const node = document.createElement(tag)
+  for (const [name, value] of Object.entries(attributes)) node.setAttribute(name, value)
+  node.append(...children)
+  return node
+}
+
+const icon = (name) => {
+  const svg = document.createElementNS("http://www.w3.org/2000/svg", "svg")
+  svg.setAttribute("viewBox", "0 0 24 24")
+  svg.setAttribute("aria-hidden", "true")
+  const path = document.createElementNS("http://www.w3.org/2000/svg", "path")
+  path.setAttribute("d", ICONS[name])
+  svg.append(path)
+  return svg
+}
+
+const figureViews = () => {
+  const found = {}
+  const look = (view) => {
+    if (view.model?.type === "Figure" && view.model.name) found[view.model.name] = view
+    for (const child of view.child_views ?? []) look(child)
+  }
+  for (const root of Object.values(Bokeh.index.roots ?? Bokeh.index)) look(root)
+  return found
+}
+
+export function render({ model, el }) {
+  let run = model.run
+  let time = run.start      // in samples, with a fraction while playing
+  let playing = false
+  let before = 0
+  let frame = 0
+  let views = {}
+  const layers = new Map()
+  const statistics = { frames: 0 }
+
+  // The bar of buttons
+
+  const button = (name, label, action) => {
+    const made = element("button", { type: "button", "aria-label": label, title: label })
+    made.append(icon(name))
+    made.addEventListener("click", action)
+    return made
+  }
+  const last = () => run.samples - 1
+  const go = (sample) => {
+    time = Math.min(Math.max(sample, 0), last())
+    request()
+  }
+  const play = (on) => {
+    playing = on
+    if (on && time >= last()) time = 0
+    toggle.replaceChildren(icon(on ? "pause" : "play"))
+    const label = on ? "Pause (space)" : "Play (space)"
+    toggle.setAttribute("aria-label", label)
+    toggle.title = label
+    before = performance.now()
+    request()
+  }
+  const step = (by) => { play(false); go(Math.floor(time + 1e-9) + by) }
+  const toggle = button("play", "Play (space)", () => play(!playing))
+  toggle.classList.add("main")
+  const scrub = element("input", {
+    type: "range", min: 0, max: last(), step: 1, "aria-label": "Sample", name: "sample",
+  })
+  scrub.addEventListener("input", () => { play(false); go(Number(scrub.value)) })
+  const clock = element("output", { class: "clock", "aria-live": "off" })
+  const speed = element("select", { "aria-label": "Speed", title: "Samples a second" })
+  for (const rate of [1, 2, 5, 10, 20, 50]) {
+    const option = element("option", { value: rate }, `${rate} samples/s`)
+    option.selected = rate === 10
+    speed.append(option)
+  }
+  const check = (name, text, on) => {
+    const box = element("input", { type: "checkbox", name })
+    box.checked = on
+    box.addEventListener("change", () => request())
+    return [box, element("label", { class: "check" }, box, text)]
+  }
+  const [loop, loopLabel] = check("loop", "Loop", true)
+  const [fan, fanLabel] = check("fan", "Past plans", false)
+  const status = element("div", { class: "status", role: "status" })
+  el.append(
+    element("div", { class: "player", role: "group", "aria-label": "Player" },
+      element("div", { class: "buttons" },
+        button("first", "To the start (Home)", () => { play(false); go(0) }),
+        button("back", "One sample back (left arrow)", () => step(-1)),
+        toggle,
+        button("forward", "One sample on (right arrow)", () => step(1)),
+        button("last", "To the end (End)", () => { play(false); go(last()) })),
+      scrub, clock,
+      element("div", { class: "options" }, speed, loopLabel, fanLabel)),
+    status)
+
+  const keys = (event) => {
+    const at = event.composedPath()[0]
+    if (event.altKey || event.ctrlKey || event.metaKey) return
+    if (/^(INPUT|SELECT|TEXTAREA|BUTTON|SUMMARY|A)$/.test(at.tagName ?? "")) return
+    const action = {
+      " ": () => play(!playing), ArrowLeft: () => step(-1), ArrowRight: () => step(1),
+      Home: () => { play(false); go(0) }, End: () => { play(false); go(last()) },
+    }[event.key]
+    if (action) { event.preventDefault(); action() }
+  }
+  document.addEventListener("keydown", keys)
+
+  // The picture
+
+  const layerOf = (view) => {
+    const primary = view.canvas_view?.primary?.el ?? view.canvas.primary.el
+    let canvas = layers.get(view)
+    if (!canvas) {
+      canvas = element("canvas", { class: "nmss-moving" })
+      canvas.style.cssText = "position:absolute;top:0;left:0;pointer-events:none"
+      layers.set(view, canvas)
+    }
+    if (canvas.previousSibling !== primary) primary.after(canvas)
+    const width = primary.clientWidth, height = primary.clientHeight
+    const ratio = window.devicePixelRatio || 1
+    if (canvas.width !== Math.round(width * ratio)
+        || canvas.height !== Math.round(height * ratio)) {
+      canvas.width = Math.round(width * ratio)
+      canvas.height = Math.round(height * ratio)
+      canvas.style.width = width + "px"
+      canvas.style.height = height + "px"
+    }
+    const context = canvas.getContext("2d")
+    context.setTransform(ratio, 0, 0, ratio, 0, 0)
+    context.clearRect(0, 0, width, height)
+    return context
+  }
+
+  const marker = (context, style, x, y, r) => {
+    context.beginPath()
+    if (style === 0) context.arc(x, y, r, 0, 7)
+    else if (style === 1) context.rect(x - r, y - r, 2 * r, 2 * r)
+    else {
+      context.moveTo(x, y - 1.2 * r)
+      context.lineTo(x + 1.2 * r, y + r)
+      context.lineTo(x - 1.2 * r, y + r)
+      context.closePath()
+    }
+    context.fill()
+  }
+
+  const trace = (context, curve, k, X, Y, dt) => {
+    const data = run.data, t0 = data[k] + curve.ahead * dt
+    const from = curve.start + k * curve.steps
+    context.beginPath()
+    for (let i = 0; i < curve.steps; i++) {
+      const x = X(t0 + i * dt), y = Y(data[from + i])
+      if (i === 0) context.moveTo(x, y)
+      else context.lineTo(x, y)
+      if (curve.held) context.lineTo(X(t0 + (i + 1) * dt), y)
+    }
+    context.stroke()
+  }
+
+  const paint = (chart, view, k, colors) => {
+    const context = layerOf(view)
+    const box = view.frame.bbox
+    const { x_range, y_range } = view.model
+    const a = box.width / (x_range.end - x_range.start)
+    const b = box.height / (y_range.end - y_range.start)
+    const X = (t) => box.left + (t - x_range.start) * a
+    const Y = (v) => box.bottom - (v - y_range.start) * b
+    const dt = run.data[1] - run.data[0]
+    const now = run.data[0] + time * dt
+    context.save()
+    context.beginPath()
+    context.rect(box.left, box.top, box.width, box.height)
+    context.clip()
+    const x = X(now)
+    context.globalAlpha = 0.82
+    context.fillStyle = colors.paper
+    context.fillRect(x, box.top, box.right - x, box.height)
+    context.lineJoin = "round"
+    if (fan.checked) {
+      context.lineWidth = 1
+      context.globalAlpha = 0.16
+      for (const curve of chart.curves) {
+        context.strokeStyle = COLORS[curve.style]
+        for (let past = 0; past < k; past++) trace(context, curve, past, X, Y, dt)
+      }
+    }
+    context.globalAlpha = 1
+    for (const curve of chart.curves) {
+      context.strokeStyle = context.fillStyle = COLORS[curve.style]
+      context.lineWidth = 1.4
+      trace(context, curve, k, X, Y, dt)
+      const t0 = run.data[k] + curve.ahead * dt, from = curve.start + k * curve.steps
+      const radius = Math.min(3.2, Math.max(1.6, a * dt / 4))
+      for (let i = 0; i < curve.steps; i++) {
+        marker(context, curve.style, X(t0 + i * dt), Y(run.data[from + i]), radius)
+      }
+    }
+    context.strokeStyle = colors.ink
+    context.lineWidth = 1
+    context.globalAlpha = 0.7
+    context.beginPath()
+    context.moveTo(Math.round(x) + 0.5, box.top)
+    context.lineTo(Math.round(x) + 0.5, box.bottom)
+    context.stroke()
+    context.restore()
+  }
+
+  const describe = (k) => {
+    const time_ = run.data[k]
+    clock.textContent = `sample ${k} \u00b7 ${Number(time_.toPrecision(4))} s`
+    scrub.value = k
+    scrub.max = last()
+    scrub.style.setProperty("--share", `${100 * k / Math.max(last(), 1)}%`)
+    scrub.setAttribute("aria-valuetext", clock.textContent)
+    run.words.forEach((words, number) => {
+      const row = status.children[number]
+      const text = words.texts[words.which[k]]
+      if (row.lastChild.textContent !== text) row.lastChild.textContent = text
+    })
+  }
+
+  const words = () => {
+    status.replaceChildren(...run.words.map(({ name }, number) => {
+      const swatch = element("span", { class: `swatch style${number}` })
+      const title = element("b", {})
+      title.textContent = name
+      return element("p", {}, swatch, title, element("span", {}))
+    }))
+  }
+
+  const colorsNow = () => {
+    const style = getComputedStyle(el)
+    return {
+      paper: style.getPropertyValue("--paper").trim() || "#fff",
+      ink: style.getPropertyValue("--ink").trim() || "#222",
+      quiet: style.getPropertyValue("--quiet").trim() || "#666",
+    }
+  }
+
+  let colors = colorsNow()
+  let described = -1
+  const draw = (moment) => {
+    frame = 0
+    if (playing) {
+      time += (moment - before) / 1000 * Number(speed.value)
+      before = moment
+      if (time >= last()) {
+        if (loop.checked) time = 0
+        else { time = last(); play(false) }
+      }
+    }
+    const k = Math.min(Math.floor(time + 1e-9), last())
+    for (const chart of run.charts) {
+      const view = views[chart.name]
+      if (view?.frame?.bbox?.width > 0) paint(chart, view, k, colors)
+    }
+    if (k !== described) { describe(k); described = k }
+    statistics.frames += 1
+    statistics.sample = k
+    statistics.playing = playing
+    if (playing) request()
+  }
+  const request = () => { if (!frame) frame = requestAnimationFrame(draw) }
+
+  // Colours of the figures follow the page without telling the server
+
+  const theme = () => {
+    colors = colorsNow()
+    const quietly = (thing, values) => thing?.setv(values, { sync: false })
+    for (const view of Object.values(views)) {
+      const plot = view.model
+      quietly(plot.title, { text_color: colors.ink })
+      for (const axis of [...plot.below, ...plot.left]) {
+        if (!axis.type.endsWith("Axis")) continue
+        quietly(axis, {
+          axis_label_text_color: colors.ink, major_label_text_color: colors.ink,
+          axis_line_color: colors.quiet, major_tick_line_color: colors.quiet,
+        })
+      }
+      for (const renderer of plot.renderers) {
+        if (renderer.name === "ink") quietly(renderer.glyph, { line_color: colors.ink })
+      }
+      for (const side of plot.center) {
+        if (side.name === "limit") quietly(side, { line_color: colors.quiet })
+      }
+    }
+    request()
+  }
+
+  const find = () => {
+    views = figureViews()
+    if (run.charts.some((chart) => !views[chart.name])) { setTimeout(find, 60); return }
+    for (const view of Object.values(views)) {
+      new ResizeObserver(() => setTimeout(request, 50)).observe(view.el)
+      for (const range of [view.model.x_range, view.model.y_range]) {
+        range.change.connect(() => setTimeout(request, 0))
+      }
+    }
+    theme()
+    setTimeout(request, 200)
+  }
+
+  model.on("run", () => {
+    run = model.run
+    described = -1
+    time = run.fresh ? run.start : Math.min(time, last())
+    words()
+    request()
+  })
+  window.addEventListener("nmss-theme", theme)
+  window.nmssPlayer = statistics  // for tests and measurements
+  words()
+  find()
+  model.on("remove", () => {
+    document.removeEventListener("keydown", keys)
+    window.removeEventListener("nmss-theme", theme)
+    cancelAnimationFrame(frame)
+  })
+}

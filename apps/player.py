@@ -1,0 +1,64 @@
+"""Components that run in the browser: the form of choices and the player."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import param
+from panel.custom import JSComponent
+
+from nmss_lab.plots import Chart, pack, sentences
+from nmss_lab.simulate import Run
+
+HERE = Path(__file__).resolve().parent
+STYLE = (HERE / "parts.css").read_text(encoding="utf-8")
+
+
+class Controls(JSComponent):
+    """A form made from a description of choices.
+
+    ``state`` comes from the server: "groups", "values", "defaults" and the number of
+    the "message" it answers.  ``sent`` goes to the server: all values and "message".
+    """
+
+    state = param.Dict(default={})
+    sent = param.Dict(default={})
+
+    _esm = HERE / "controls.js"
+    _stylesheets = (STYLE,)
+
+
+class Player(JSComponent):
+    """Moves through a run that was sent once; see ``moving``."""
+
+    run = param.Dict(default={})
+
+    _esm = HERE / "player.js"
+    _stylesheets = (STYLE,)
+
+
+def moving(
+    charts: Sequence[Chart], runs: Mapping[str, Run], start: int, fresh: bool
+) -> dict[str, Any]:
+    """What a player needs: trails, words for every sample, and where to begin.
+
+    Parameters
+    ----------
+    start : int
+        Sample shown first.
+    fresh : bool
+        Whether to go there, or to stay where the player is.
+    """
+    first = next(iter(runs.values()))
+    words = []
+    for name, run in runs.items():
+        texts, which = sentences(run)
+        words.append({"name": name, "texts": texts, "which": which.tolist()})
+    return {
+        **pack(charts, first.t),
+        "words": words,
+        "start": min(start, len(first) - 1),
+        "fresh": fresh,
+    }

@@ -1,0 +1,705 @@
+"""Choices of a session, and the runs and the Python that belong to them.
+
+Each page has one class of choices with bounds and help.  ``runs`` and ``script`` are
+made from the same lines: what the page shows is what its script prints.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any, ClassVar
+
+import numpy as np
+import param
+
+from nmss_lab.cases import CASES, Case, case, piecewise
+from nmss_lab.controller import Limits
+from nmss_lab.design import Design
+from nmss_lab.models import LinearPlant
+from nmss_lab.mpc import STRUCTURES
+from nmss_lab.predict import Horizon
+from nmss_lab.simulate import Run, Scenario, closed_loop
+
+DIVERGED = 1e9
+"""Outputs beyond this are not drawn: the loop is unstable."""
+
+MOST_RUNS = 3
+
+
+@functools.cache
+def known_case(name: str) -> Case:
+    """Build a case once; cases are immutable."""
+    return case(name)
+
+
+def plain(name: str) -> str:
+    """Name of a design or case in words."""
+    special = {
+        "pip": "PIP",
+        "pip_forward": "PIP, forward path",
+        "wang_young": "Wang-Young",
+        "integral_of_error": "Integral of error",
+        "integral_of_error_b": "Integral of error, weights b",
+        "disturbance_direct": "Disturbance, direct",
+        "disturbance_augmented": "Disturbance, augmented",
+    }
+    return special.get(name, name.replace("_", " ").capitalize())
+
+
+class Choices(param.Parameterized):
+    """What both pages share: case, limits, plant against model, disturbances."""
+
+    case = param.Selector(
+        label="Case", doc="A worked example: plant, model, weights and scenario."
+    )
+    output = param.Integer(
+        0, bounds=(0, 11), label="Output shown", doc="Which output y the plots show."
+    )
+    input = param.Integer(
+        0, bounds=(0, 11), label="Input shown", doc="Which input u the plots show."
+    )
+    Np = param.Integer(
+        20,
+        bounds=(1, 80),
+        label="Prediction horizon Np",
+        doc="Number of samples Np over which the controller predicts.",
+    )
+    limit_u = param.Selector(
+        default="case",
+        objects=["case", "off", "own"],
+        label="Limits on the input u",
+        doc="Lowest and highest value of u: those of the case, none, or your own.",
+    )
+    u_max = param.Number(
+        1.0,
+        bounds=(0.01, 1000.0),
+        label="Input between plus and minus",
+        doc="Your own limit on u, used when 'own' is chosen.",
+    )
+    limit_du = param.Selector(
+        default="case",
+        objects=["case", "off", "own"],
+        label="Limits on the change du",
+        doc="How much u may change in one sample.",
+    )
+    du_max = param.Number(
+        1.0,
+        bounds=(0.01, 1000.0),
+        label="Change between plus and minus",
+        doc="Your own limit on du, used when 'own' is chosen.",
+    )
+    limit_y = param.Selector(
+        default="case",
+        objects=["case", "off", "own"],
+        label="Limits on the output y",
+        doc="Output limits give way where they cannot be kept.",
+    )
+    y_max = param.Number(
+        1.0,
+        bounds=(0.01, 1000.0),
+        label="Output between plus and minus",
+        doc="Your own limit on y, used when 'own' is chosen.",
+    )
+    gain = param.Number(
+        0.0,
+        bounds=(-50.0, 50.0),
+        step=1.0,
+        label="Gain of the plant, per cent off",
+        doc="The plant's gain against the model's; the controller does not know.",
+    )
+    dynamics = param.Number(
+        0.0,
+        bounds=(-20.0, 20.0),
+        step=0.5,
+        label="Dynamics of the plant, per cent off",
+        doc="Slower (+) or faster (-) plant; for a difference equation its "
+        "coefficients a are multiplied, as in (6.11).",
+    )
+    step_u = param.Number(
+        0.0,
+        bounds=(-1.0, 1.0),
+        label="Step disturbance at the input",
+        doc="Added to the input u of the plant, not measured.",
+    )
+    step_y = param.Number(
+        0.0,
+        bounds=(-1.0, 1.0),
+        label="Step disturbance at the output",
+        doc="Added to the output y of the plant, not measured.",
+    )
+    step_at = param.Integer(
+        50,
+        bounds=(0, 100),
+        label="Time of the step, per cent of the run",
+        doc="When both disturbances set in.",
+    )
+
+    scale: ClassVar[dict[str, str]] = {"u_max": "log", "du_max": "log", "y_max": "log"}
+    groups: ClassVar[dict[str, tuple[str, ...]]] = {}
+    default_case: ClassVar[str] = ""
+
+    def __init__(self, **values: Any) -> None:
+        super().__init__()
+        self.param["case"].objects = self.cases()
+        self.take_case(self.default_case)
+        self.accept(values)
+
+    @classmethod
+    def cases(cls) -> list[str]:
+        """Cases that this page can show."""
+        return list(CASES)
+
+    @property
+    def example(self) -> Case:
+        """The chosen case."""
+        return known_case(self.case)
+
+    def take_case(self, name: str) -> None:
+        """Choose a case and put every other choice where the case has it."""
+        example = known_case(name)
+        for key, parameter in self.param.objects("existing").items():
+            if key not in ("name", "case"):
+                setattr(self, key, parameter.default)
+        self.case = name
+        for key, size in (("output", example.model.n_y), ("input", example.model.n_u)):
+            self.param[key].bounds = (0, size - 1)
+        scenario = example.scenario
+        r = _largest(scenario.reference, scenario.output_disturbance)
+        u = _largest(*_finite_sides(self._main_design.limits.u), scenario.u0)
+        for key, size in (("step_y", r), ("step_u", u)):
+            size = _round_number(size)
+            self.param[key].bounds, self.param[key].step = (-size, size), size / 50
+        limits = self._main_design.limits
+        for key, sides in (
+            ("u_max", limits.u),
+            ("du_max", limits.du),
+            ("y_max", limits.y),
+        ):
+            finite = _finite_sides(sides)
+            setattr(self, key, min(max(_largest(*finite), 0.01), 1000.0))
+
+    @property
+    def _main_design(self) -> Design:
+        return next(iter(self.example.designs.values()))
+
+    def accept(self, values: Mapping[str, Any]) -> None:
+        """Take over values that came from outside, as far as they are allowed.
+
+        Raises
+        ------
+        ValueError
+            Naming the first choice that is not, and what was expected; the others
+            are taken.
+        """
+        wrong = ""
+        if "case" in values and values["case"] != self.case:
+            if values["case"] not in self.cases():
+                raise ValueError(
+                    f"case = {values['case']!r}: there is no such case here"
+                )
+            self.take_case(values["case"])
+        for key in (k for k in values if k in self.names() and k != "case"):
+            try:
+                setattr(self, key, self._read(key, values[key]))
+            except (ValueError, TypeError) as error:
+                wrong = wrong or f"{key} = {values[key]!r}: {_short(error)}"
+        if wrong:
+            raise ValueError(wrong)
+
+    def _read(self, key: str, value: Any) -> Any:
+        """Value of a choice, also from the text of an address."""
+        parameter = self.param[key]
+        if isinstance(parameter, param.ListSelector):
+            return value.split(",") if isinstance(value, str) else list(value)
+        if isinstance(parameter, param.Integer):
+            return int(value)
+        if isinstance(parameter, param.Number):
+            return float(value)
+        return value
+
+    @classmethod
+    def names(cls) -> list[str]:
+        """Names of all choices, in the order in which a page shows them."""
+        return [key for keys in cls.groups.values() for key in keys]
+
+    def values(self) -> dict[str, Any]:
+        """All choices, as plain data."""
+        return {key: getattr(self, key) for key in self.names()}
+
+    def defaults(self) -> dict[str, Any]:
+        """All choices as they are when the case is chosen."""
+        fresh = type(self)()
+        fresh.take_case(self.case)
+        return {**fresh.values(), "case": self.default_case}
+
+    def description(self) -> list[dict[str, Any]]:
+        """Groups of controls: what a form needs to show each choice."""
+        return [
+            {"title": title, "items": [self._item(k) for k in keys if self._shown(k)]}
+            for title, keys in self.groups.items()
+        ]
+
+    def _shown(self, key: str) -> bool:
+        model = self.example.model
+        return not (
+            (key == "output" and model.n_y == 1) or (key == "input" and model.n_u == 1)
+        )
+
+    def _item(self, key: str) -> dict[str, Any]:
+        parameter = self.param[key]
+        item = {"name": key, "label": parameter.label, "help": parameter.doc}
+        if isinstance(parameter, param.ListSelector):
+            options = [[name, plain(name)] for name in parameter.objects]
+            return {**item, "kind": "several", "options": options, "most": MOST_RUNS}
+        if isinstance(parameter, param.Selector):
+            return {**item, "kind": "one", "options": self._options(key)}
+        if key in ("output", "input"):
+            model = self.example.model
+            names = model.y_names if key == "output" else model.u_names
+            return {
+                **item,
+                "kind": "one",
+                "options": [[i, n] for i, n in enumerate(names)],
+            }
+        low, high = parameter.bounds
+        step = parameter.step or (1 if isinstance(parameter, param.Integer) else None)
+        kind = "log" if self.scale.get(key) == "log" else "linear"
+        return {**item, "kind": kind, "low": low, "high": high, "step": step}
+
+    def _options(self, key: str) -> list[list[str]]:
+        if key == "case":
+            return [[name, _case_title(known_case(name))] for name in self.cases()]
+        words = {"case": "as in the case", "off": "none"}
+        return [[name, words.get(name, name)] for name in self.param[key].objects]
+
+    # From choices to runs. Every line here has its twin in ``script``.
+
+    def plant(self) -> LinearPlant:
+        """Plant of the case, changed against the model as chosen."""
+        example, plant = self.example, self.example.plant
+        if self.dynamics and example.continuous is not None:
+            slower = 1.0 + self.dynamics / 100.0
+            substeps = len(plant.between.times) if plant.between else 1
+            plant = example.continuous.sampled(plant.dt / slower, substeps)
+            between = plant.between and replace(
+                plant.between, times=plant.between.times * slower
+            )
+            plant = replace(plant, dt=example.plant.dt, between=between)
+        elif self.dynamics:
+            factor = 1.0 + self.dynamics / 100.0
+            plant = example.model.varied(denominator=factor).plant()
+        if self.gain:
+            factor = 1.0 + self.gain / 100.0
+            between = plant.between and replace(
+                plant.between, B=factor * plant.between.B
+            )
+            plant = replace(plant, B=factor * plant.B, between=between)
+        return plant
+
+    def limits(self, limits: Limits) -> Limits:
+        """Limits of a design, replaced as chosen."""
+        return replace(limits, **{key: sides for key, sides, _ in self._own_limits()})
+
+    def _own_limits(self) -> list[tuple[str, tuple[float, float], str]]:
+        """Limits that differ from the case's: name, sides and their Python."""
+        found = []
+        for key in ("u", "du", "y"):
+            kind, size = getattr(self, f"limit_{key}"), getattr(self, f"{key}_max")
+            if kind == "off":
+                found.append((key, (-np.inf, np.inf), "(-np.inf, np.inf)"))
+            elif kind == "own":
+                found.append((key, (-size, size), f"({-size!r}, {size!r})"))
+        return found
+
+    def scenario(self) -> Scenario:
+        """Scenario of the case with the chosen disturbances."""
+        scenario, model, N = self.example.scenario, self.example.model, self._samples
+        if self.step_u:
+            step = piecewise(
+                N, (self._first, np.eye(model.n_u)[self.input] * self.step_u)
+            )
+            before = scenario.of("input_disturbance", model.n_u)
+            scenario = replace(scenario, input_disturbance=before + step)
+        if self.step_y:
+            step = piecewise(
+                N, (self._first, np.eye(model.n_y)[self.output] * self.step_y)
+            )
+            before = scenario.of("output_disturbance", model.n_y)
+            scenario = replace(scenario, output_disturbance=before + step)
+        return scenario
+
+    @property
+    def _samples(self) -> int:
+        return len(self.example.scenario)
+
+    @property
+    def _first(self) -> int:
+        return min(round(self.step_at / 100.0 * self._samples), self._samples - 1)
+
+    def designs(self) -> dict[str, Design]:
+        """Designs to run, by name."""
+        raise NotImplementedError
+
+    def runs(self) -> dict[str, Run]:
+        """Run every design.
+
+        Raises
+        ------
+        ValueError
+            If a design cannot be built, or its loop diverges; says which and why.
+        """
+        plant, scenario = self.plant(), self.scenario()
+        return {
+            name: self._run(name, design, plant, scenario)
+            for name, design in self.designs().items()
+        }
+
+    def _run(
+        self, name: str, design: Design, plant: LinearPlant, scenario: Scenario
+    ) -> Run:
+        try:
+            controller = design.build()
+            with np.errstate(all="ignore"):
+                run = closed_loop(plant, controller, scenario)
+        except (ValueError, np.linalg.LinAlgError) as error:
+            raise ValueError(f"{plain(name)}: {error}") from error
+        if not np.abs(run.y).max() < DIVERGED:
+            raise ValueError(
+                f"{plain(name)}: the loop is unstable, its output grows beyond "
+                f"{DIVERGED:g}. Try the plant nearer to the model, or wider limits."
+            )
+        return run
+
+    def script(self) -> str:
+        """Python that computes what the page shows and prints its measures."""
+        lines = [
+            *_SCRIPT_IMPORTS,
+            "",
+            f'example = case("{self.case}")',
+            *self._plant_lines(),
+            *self._scenario_lines(),
+            "",
+            *self._design_lines(),
+            "",
+            f"for row in table(runs, channel={self.output}):",
+            "    print(row)",
+        ]
+        return "\n".join(lines) + "\n"
+
+    def _plant_lines(self) -> list[str]:
+        lines = ["plant = example.plant"]
+        if self.dynamics and self.example.continuous is not None:
+            between = self.example.plant.between
+            lines += [
+                f"slower = 1.0 + {self.dynamics!r} / 100.0",
+                "plant = example.continuous.sampled("
+                f"plant.dt / slower, {len(between.times) if between else 1})",
+                "between = plant.between and replace(",
+                "    plant.between, times=plant.between.times * slower",
+                ")",
+                "plant = replace(plant, dt=example.plant.dt, between=between)",
+            ]
+        elif self.dynamics:
+            lines += [
+                f"factor = 1.0 + {self.dynamics!r} / 100.0",
+                "plant = example.model.varied(denominator=factor).plant()",
+            ]
+        if self.gain:
+            lines += [
+                f"factor = 1.0 + {self.gain!r} / 100.0",
+                "between = plant.between and replace(",
+                "    plant.between, B=factor * plant.between.B",
+                ")",
+                "plant = replace(plant, B=factor * plant.B, between=between)",
+            ]
+        return lines
+
+    def _scenario_lines(self) -> list[str]:
+        lines, model = ["scenario = example.scenario"], self.example.model
+        for name, size, channel, value in (
+            ("input_disturbance", model.n_u, self.input, self.step_u),
+            ("output_disturbance", model.n_y, self.output, self.step_y),
+        ):
+            if value:
+                change = f"np.eye({size})[{channel}] * {value!r}"
+                lines += [
+                    f"step = piecewise({self._samples}, ({self._first}, {change}))",
+                    f'before = scenario.of("{name}", {size})',
+                    f"scenario = replace(scenario, {name}=before + step)",
+                ]
+        return lines
+
+    def _limit_lines(self) -> list[str]:
+        """Lines that change ``limits`` inside the loop of a script."""
+        own = ", ".join(f"{key}={text}" for key, _, text in self._own_limits())
+        return [f"    limits = replace(limits, {own})"] if own else []
+
+    def _design_lines(self) -> list[str]:
+        raise NotImplementedError
+
+
+class LoopChoices(Choices):
+    """Choices of the page on the receding horizon."""
+
+    structures = param.ListSelector(
+        default=[],
+        label="Structures",
+        doc="Up to three controllers of this case, side by side.",
+    )
+    Nc = param.Integer(
+        5,
+        bounds=(1, 30),
+        label="Control horizon Nc",
+        doc="Number of moves Nc that are free; after them the input rests.",
+    )
+    weight_y = param.Number(
+        1.0,
+        bounds=(1e-3, 1e3),
+        label="Output weight, times the case's Q",
+        doc="More makes the outputs follow more tightly (Q).",
+    )
+    weight_move = param.Number(
+        1.0,
+        bounds=(1e-3, 1e3),
+        label="Move weight, times the case's R",
+        doc="More makes the inputs calmer (R).",
+    )
+    reading = param.Selector(
+        default="case",
+        objects=["case", "held", "next", "preview", "zero"],
+        label="Reading of the reference",
+        doc="What the plan knows of r ahead: r_k held, r_(k+1) held, the true future, "
+        "or nothing (S = 0).",
+    )
+
+    scale: ClassVar[dict[str, str]] = {
+        **Choices.scale,
+        "weight_y": "log",
+        "weight_move": "log",
+    }
+    groups: ClassVar[dict[str, tuple[str, ...]]] = {
+        "Case": ("case", "structures", "output", "input"),
+        "Design": ("Np", "Nc", "weight_y", "weight_move", "reading"),
+        "Limits": ("limit_u", "u_max", "limit_du", "du_max", "limit_y", "y_max"),
+        "Plant and disturbances": ("gain", "dynamics", "step_u", "step_y", "step_at"),
+    }
+    default_case: ClassVar[str] = "governor_3_4"
+
+    def take_case(self, name: str) -> None:
+        """Choose a case: its predictive designs, and the horizons of the first."""
+        designs = known_case(name).designs
+        predictive = [key for key, d in designs.items() if d.structure in STRUCTURES]
+        self.structures, self.param["structures"].objects = [], predictive
+        self._predictive = predictive
+        super().take_case(name)
+        self.structures = _first_choice(predictive)
+        horizon = self._main_design.horizon
+        self.Np, self.Nc = horizon.Np, horizon.Nc
+
+    @property
+    def _main_design(self) -> Design:
+        return known_case(self.case).designs[_first_choice(self._predictive)[0]]
+
+    def designs(self) -> dict[str, Design]:
+        """Chosen structures with the chosen horizons, weights and limits."""
+        if not 1 <= len(self.structures) <= MOST_RUNS:
+            raise ValueError(
+                f"structures: {len(self.structures)} chosen, expected 1 to {MOST_RUNS}"
+            )
+        return {
+            name: self._changed(self.example.designs[name]) for name in self.structures
+        }
+
+    def _changed(self, design: Design) -> Design:
+        reading = design.reference if self.reading == "case" else self.reading
+        return replace(
+            design,
+            horizon=Horizon(self.Np, self.Nc),
+            Q=self.weight_y * np.asarray(design.Q),
+            R=self.weight_move * np.asarray(design.R),
+            limits=self.limits(design.limits),
+            reference=reading,
+        )
+
+    def _design_lines(self) -> list[str]:
+        reading = (
+            [] if self.reading == "case" else [f'        reference="{self.reading}",']
+        )
+        return [
+            "runs = {}",
+            f"for name in {list(self.structures)!r}:",
+            "    design = example.designs[name]",
+            "    limits = design.limits",
+            *self._limit_lines(),
+            "    design = replace(",
+            "        design,",
+            f"        horizon=Horizon({self.Np}, {self.Nc}),",
+            f"        Q={self.weight_y!r} * np.asarray(design.Q),",
+            f"        R={self.weight_move!r} * np.asarray(design.R),",
+            "        limits=limits,",
+            *reading,
+            "    )",
+            "    runs[name] = closed_loop(plant, design.build(), scenario)",
+        ]
+
+
+class GovernorChoices(Choices):
+    """Choices of the page on the reference governor."""
+
+    timing = param.Selector(
+        default="held",
+        objects=["held", "preview"],
+        label="Knowledge of the reference",
+        doc="'held': w_k is chosen from r_k; 'preview': w_(k+1) from the true future, "
+        "as printed in (3.12).",
+    )
+    reading = param.Selector(
+        default="free",
+        objects=["free", "zero after step s", "decaying"],
+        label="Perturbation beta over the horizon",
+        doc="The three readings of section 3.3.",
+    )
+    free_until = param.Integer(
+        5,
+        bounds=(1, 80),
+        label="Step s",
+        doc="Last step at which beta is free, when 'zero after step s' is chosen.",
+    )
+    decay = param.Number(
+        0.8,
+        bounds=(0.05, 1.0),
+        step=0.05,
+        label="Decay",
+        doc="Factor by which beta shrinks a step, when 'decaying' is chosen.",
+    )
+    reference = param.Number(
+        1.0,
+        bounds=(0.1, 3.0),
+        step=0.05,
+        label="Size of the reference, times the case's",
+        doc="Larger steps of r bring the loop closer to its limits.",
+    )
+
+    groups: ClassVar[dict[str, tuple[str, ...]]] = {
+        "Case": ("case", "reference", "output", "input"),
+        "Governor": ("Np", "reading", "free_until", "decay", "timing"),
+        "Limits": ("limit_u", "u_max", "limit_du", "du_max", "limit_y", "y_max"),
+        "Plant and disturbances": ("gain", "dynamics", "step_u", "step_y", "step_at"),
+    }
+    default_case: ClassVar[str] = "governor_3_4"
+
+    @classmethod
+    @functools.cache
+    def cases(cls) -> list[str]:
+        """Cases with a governor and with the same gain alone."""
+        return [n for n in CASES if {"governor", "pip"} <= set(known_case(n).designs)]
+
+    @property
+    def _main_design(self) -> Design:
+        return known_case(self.case).designs["governor"]
+
+    def take_case(self, name: str) -> None:
+        """Choose a case and the governor's horizon."""
+        super().take_case(name)
+        self.Np = self._main_design.horizon.Np
+        self.timing = "preview" if self._main_design.reference == "preview" else "held"
+
+    def scenario(self) -> Scenario:
+        """Scenario with the reference made larger or smaller."""
+        scenario = super().scenario()
+        return replace(scenario, reference=self.reference * scenario.reference)
+
+    def designs(self) -> dict[str, Design]:
+        """The governor, and its gain alone."""
+        governor, pip = (self.example.designs[name] for name in ("governor", "pip"))
+        options = {**governor.options, **self._reading()}
+        governor = replace(
+            governor,
+            horizon=Horizon(self.Np, self.Np),
+            limits=self.limits(governor.limits),
+            reference=self.timing,
+            options=options,
+        )
+        pip = replace(pip, limits=self.limits(pip.limits))
+        return {"with governor": governor, "without": pip}
+
+    def _reading(self) -> dict[str, Any]:
+        if self.reading == "zero after step s":
+            return {"free_until": self.free_until}
+        return {"decay": self.decay} if self.reading == "decaying" else {}
+
+    def _scenario_lines(self) -> list[str]:
+        return [
+            *super()._scenario_lines(),
+            "scenario = replace(",
+            f"    scenario, reference={self.reference!r} * scenario.reference",
+            ")",
+        ]
+
+    def _design_lines(self) -> list[str]:
+        return [
+            "runs = {}",
+            'for name, key in {"with governor": "governor", "without": "pip"}.items():',
+            "    design = example.designs[key]",
+            "    limits = design.limits",
+            *self._limit_lines(),
+            "    design = replace(design, limits=limits)",
+            '    if key == "governor":',
+            f"        options = {{**design.options, **{self._reading()!r}}}",
+            "        design = replace(",
+            "            design,",
+            f"            horizon=Horizon({self.Np}, {self.Np}),",
+            f'            reference="{self.timing}",',
+            "            options=options,",
+            "        )",
+            "    runs[name] = closed_loop(plant, design.build(), scenario)",
+        ]
+
+
+_SCRIPT_IMPORTS = (
+    "from dataclasses import replace",
+    "",
+    "import numpy as np",
+    "",
+    "from nmss_lab.cases import case, piecewise",
+    "from nmss_lab.measures import table",
+    "from nmss_lab.predict import Horizon",
+    "from nmss_lab.simulate import closed_loop",
+)
+
+
+def _case_title(example: Case) -> str:
+    return f"{example.section}  {example.title}"
+
+
+def _first_choice(predictive: list[str]) -> list[str]:
+    """Structures a page opens with."""
+    wanted = [n for n in ("wang_young", "integral_of_error") if n in predictive]
+    return wanted or predictive[:2]
+
+
+def _finite_sides(sides: tuple[Any, Any]) -> list[Any]:
+    return [np.asarray(side, float)[np.isfinite(side)] for side in sides]
+
+
+def _largest(*series: Any) -> float:
+    """Largest absolute value; 1 where all are absent or zero."""
+    found = [float(np.abs(s).max()) for s in series if s is not None and np.size(s)]
+    return max(found, default=0.0) or 1.0
+
+
+def _round_number(value: float) -> float:
+    """Smallest of 1, 2, 5, 10, ... times a power of ten that is not below."""
+    power = 10.0 ** math.floor(math.log10(value))
+    return power * min(
+        m for m in (1.0, 2.0, 5.0, 10.0) if m * power >= value * (1 - 1e-9)
+    )
+
+
+def _short(error: Exception) -> str:
+    """Message of an error without the name of the class it came from."""
+    text = str(error)
+    return text.rsplit("Choices.", 1)[-1].partition("' ")[2] or text
