@@ -14,10 +14,16 @@ import pytest
 from conftest import ROOT
 
 import nmss_lab
-from nmss_lab import DifferenceModel, Horizon, Limits, Status
-from nmss_lab.governor import governor
-from nmss_lab.mpc import STRUCTURES
-from nmss_lab.pip import lq_gain, pip
+from nmss_lab import (
+    STRUCTURES,
+    DifferenceModel,
+    Horizon,
+    Limits,
+    Status,
+    governor,
+    lq_gain,
+    pip,
+)
 
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *ROOT.glob("docs/*.md")]
 README = PAGES[0].read_text(encoding="utf-8")
