@@ -16,7 +16,7 @@ import importlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeGuard
 
 import numpy as np
 import scipy.linalg
@@ -383,14 +383,19 @@ def solve(
         return Solution(*nothing, QPStatus.FAILED, message=f"{backend}: {error!r}")
     if infeasible:
         return Solution(*nothing, QPStatus.INFEASIBLE, iterations)
-    if z is None or not np.isfinite(z).all() or not np.isfinite(multipliers).all():
-        return Solution(
-            *nothing, QPStatus.FAILED, iterations, message=f"{backend} gave no numbers"
-        )
+    if not (_usable(z, program.n_z) and _usable(multipliers, len(known))):
+        said = f"{backend} gave no finite decision of the right size"
+        return Solution(*nothing, QPStatus.FAILED, iterations, message=said)
     z, multipliers, residual = _polish(problem, z, multipliers)
     good = residual <= ACCEPTED
     status = QPStatus.SOLVED if good else QPStatus.INACCURATE
     return Solution(z, multipliers, status, iterations, residual)
+
+
+def _usable(values: Array | None, size: int) -> TypeGuard[Array]:
+    if values is None or np.shape(values) != (size,):
+        return False
+    return bool(np.isfinite(values).all())
 
 
 def kkt_residual(problem: Problem, z: Array, multipliers: Array) -> float:
@@ -465,7 +470,10 @@ def _proxqp(problem: Problem) -> Answer:
     qp.settings.check_duality_gap = True
     qp.settings.eps_duality_gap_abs = 1e-8
     qp.settings.eps_duality_gap_rel = 1e-9
-    qp.settings.max_iter = 10_000
+    # Contradicting limits would keep it busy for minutes, and the loose default test
+    # for them (1e-4) rejects sound problems when started warm.
+    qp.settings.max_iter = 1_000
+    qp.settings.eps_primal_inf = 1e-10
     qp.init(problem.H, problem.f, None, None, problem.M, problem.lower, problem.upper)
     if problem.guess is None:
         qp.solve()
