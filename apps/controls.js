@@ -23,15 +23,24 @@ export function render({ model, el }) {
   let changed = false  // whether values changed since it was sent
   let sent = 0
   let address = 0
+  let painted = () => {}
   const open = {}
   const update = {}    // name -> function that shows a value
   const form = element("form", { class: "controls", "aria-label": "Choices" })
   form.addEventListener("submit", (event) => event.preventDefault())
   el.append(form)
 
+  const latency = []   // of the latest answers: milliseconds from choice to picture
+  window.nmssForm = { latency }  // for tests and measurements
+
   const send = () => {
     if (waiting !== null) { changed = true; return }
     changed = false
+    const left = performance.now()
+    painted = () => {
+      latency.push(performance.now() - left)
+      if (latency.length > 500) latency.shift()
+    }
     waiting = ++sent
     model.sent = { ...values, message: waiting }
   }
@@ -46,7 +55,7 @@ export function render({ model, el }) {
 
   const writeAddress = () => {
     const query = new URLSearchParams()
-    const defaults = model.state.defaults
+    const defaults = model.form.defaults
     for (const [name, value] of Object.entries(values)) {
       if (!same(value, defaults[name])) query.set(name, value)
     }
@@ -122,7 +131,7 @@ export function render({ model, el }) {
     }
     form.replaceChildren()
     for (const name of Object.keys(update)) delete update[name]
-    for (const [number, group] of model.state.groups.entries()) {
+    for (const [number, group] of model.form.groups.entries()) {
       const part = element("details", {})
       part.dataset.title = group.title
       part.open = open[group.title] ?? true
@@ -153,14 +162,18 @@ export function render({ model, el }) {
     }
   }
 
-  let description = JSON.stringify(model.state.groups)
+  let stale = false
+  model.on("form", () => { stale = true })
   model.on("state", () => {
     const answer = model.state.message
     if (waiting !== null && answer < waiting) return
     waiting = null
+    const done = painted
+    requestAnimationFrame(() => setTimeout(done, 0))
     if (changed) { send(); return }
-    const next = JSON.stringify(model.state.groups)
-    if (next !== description) { description = next; build() } else take()
+    if (stale) build()
+    else take()
+    stale = false
     writeAddress()
   })
   build()

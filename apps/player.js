@@ -2,7 +2,6 @@
 // between Bokeh's curves and its limits, what moves: the curtain over the future, the
 // plan of the present sample, and the fan of past plans. It knows nothing of control.
 
-const COLORS = ["#0072B2", "#D55E00", "#009E73"]
 const ICONS = {
   first: "M5 5v14M19 5 9 12l10 7z",
   back: "M8 5v14M18 5l-8 7 8 7z",
@@ -94,7 +93,7 @@ export function render({ model, el }) {
   }
   const [loop, loopLabel] = check("loop", "Loop", true)
   const [fan, fanLabel] = check("fan", "Past plans", false)
-  const status = element("div", { class: "status", role: "status" })
+  const status = document.getElementById("status")
   el.append(
     element("div", { class: "player", role: "group", "aria-label": "Player" },
       element("div", { class: "buttons" },
@@ -104,8 +103,7 @@ export function render({ model, el }) {
         button("forward", "One sample on (right arrow)", () => step(1)),
         button("last", "To the end (End)", () => { play(false); go(last()) })),
       scrub, clock,
-      element("div", { class: "options" }, speed, loopLabel, fanLabel)),
-    status)
+      element("div", { class: "options" }, speed, loopLabel, fanLabel)))
 
   const keys = (event) => {
     const at = event.composedPath()[0]
@@ -193,14 +191,14 @@ export function render({ model, el }) {
     if (fan.checked) {
       context.lineWidth = 1
       context.globalAlpha = 0.16
-      for (const curve of chart.curves) {
-        context.strokeStyle = COLORS[curve.style]
+      for (const curve of chart.trails) {
+        context.strokeStyle = colors.styles[curve.style]
         for (let past = 0; past < k; past++) trace(context, curve, past, X, Y, dt)
       }
     }
     context.globalAlpha = 1
-    for (const curve of chart.curves) {
-      context.strokeStyle = context.fillStyle = COLORS[curve.style]
+    for (const curve of chart.trails) {
+      context.strokeStyle = context.fillStyle = colors.styles[curve.style]
       context.lineWidth = 1.4
       trace(context, curve, k, X, Y, dt)
       const t0 = run.data[k] + curve.ahead * dt, from = curve.start + k * curve.steps
@@ -221,7 +219,7 @@ export function render({ model, el }) {
 
   const describe = (k) => {
     const time_ = run.data[k]
-    clock.textContent = `sample ${k} \u00b7 ${Number(time_.toPrecision(4))} s`
+    clock.textContent = `sample ${k} \u00b7 ${Number(time_.toPrecision(4))} ${run.unit}`
     scrub.value = k
     scrub.max = last()
     scrub.style.setProperty("--share", `${100 * k / Math.max(last(), 1)}%`)
@@ -243,11 +241,11 @@ export function render({ model, el }) {
   }
 
   const colorsNow = () => {
-    const style = getComputedStyle(el)
+    const style = getComputedStyle(document.documentElement)
+    const read = (name) => style.getPropertyValue(name).trim()
     return {
-      paper: style.getPropertyValue("--paper").trim() || "#fff",
-      ink: style.getPropertyValue("--ink").trim() || "#222",
-      quiet: style.getPropertyValue("--quiet").trim() || "#666",
+      paper: read("--paper"), ink: read("--ink"), quiet: read("--quiet"),
+      styles: [read("--style0"), read("--style1"), read("--style2")],
     }
   }
 
@@ -280,7 +278,6 @@ export function render({ model, el }) {
 
   const theme = () => {
     colors = colorsNow()
-    const quietly = (thing, values) => thing?.setv(values, { sync: false })
     for (const view of Object.values(views)) {
       const plot = view.model
       quietly(plot.title, { text_color: colors.ink })
@@ -292,7 +289,11 @@ export function render({ model, el }) {
         })
       }
       for (const renderer of plot.renderers) {
-        if (renderer.name === "ink") quietly(renderer.glyph, { line_color: colors.ink })
+        const name = renderer.name ?? ""
+        const color = name.startsWith("style") ? colors.styles[name.at(-1)] : colors.ink
+        for (const glyph of [renderer.glyph, renderer.nonselection_glyph]) {
+          quietly(glyph, { line_color: { value: color } })
+        }
       }
       for (const side of plot.center) {
         if (side.name === "limit") quietly(side, { line_color: colors.quiet })
@@ -314,8 +315,33 @@ export function render({ model, el }) {
     setTimeout(request, 200)
   }
 
+  // A new run: curves, ranges and labels go to Bokeh without telling the server
+
+  const quietly = (thing, values) => thing?.setv(values, { sync: false })
+
+  const fill = (chart, view) => {
+    const plot = view.model
+    for (const { name, start, size } of chart.lines) {
+      const source = plot.renderers.find((renderer) => renderer.name === name).data_source
+      source.data.t = run.data.subarray(start, start + size)
+      source.data.y = run.data.subarray(start + size, start + 2 * size)
+      source.change.emit()
+    }
+    const limits = plot.center.filter((side) => side.name === "limit")
+    limits.forEach((side, i) => quietly(side, { location: chart.limits[i] }))
+    quietly(plot.y_range, { start: chart.vertical[0], end: chart.vertical[1] })
+    quietly(plot.left[0], { axis_label: chart.axis })
+    quietly(plot.below[0], { axis_label: `time [${run.unit}]` })
+    quietly(plot.title, { text: chart.title })
+    const [start, end] = chart.span
+    if (plot.x_range.reset_start !== start || plot.x_range.reset_end !== end) {
+      quietly(plot.x_range, { start, end, reset_start: start, reset_end: end })
+    }
+  }
+
   model.on("run", () => {
     run = model.run
+    for (const chart of run.charts) fill(chart, views[chart.name])
     described = -1
     time = run.fresh ? run.start : Math.min(time, last())
     words()

@@ -19,15 +19,18 @@ STYLE = (HERE / "parts.css").read_text(encoding="utf-8")
 class Controls(JSComponent):
     """A form made from a description of choices.
 
-    ``state`` comes from the server: "groups", "values", "defaults" and the number of
-    the "message" it answers.  ``sent`` goes to the server: all values and "message".
+    ``form`` and ``state`` come from the server: "groups" and "defaults", and "values"
+    and the number of the "message" they answer; ``form`` is set before ``state``.
+    ``sent`` goes to the server: all values and the number of the "message".
     """
 
+    form = param.Dict(default={})
     state = param.Dict(default={})
     sent = param.Dict(default={})
 
     _esm = HERE / "controls.js"
     _stylesheets = (STYLE,)
+    _debounce = 0  # the form itself sends one message at a time
 
 
 class Player(JSComponent):
@@ -42,7 +45,7 @@ class Player(JSComponent):
 def moving(
     charts: Sequence[Chart], runs: Mapping[str, Run], start: int, fresh: bool
 ) -> dict[str, Any]:
-    """What a player needs: trails, words for every sample, and where to begin.
+    """Gather what a player needs: trails, words for every sample, and where to begin.
 
     Parameters
     ----------
@@ -57,7 +60,7 @@ def moving(
         texts, which = sentences(run)
         words.append({"name": name, "texts": texts, "which": which.tolist()})
     return {
-        **pack(charts, first.t),
+        **pack(charts),
         "words": words,
         "start": min(start, len(first) - 1),
         "fresh": fresh,

@@ -236,7 +236,7 @@ class Choices(param.Parameterized):
         return {**fresh.values(), "case": self.default_case}
 
     def description(self) -> list[dict[str, Any]]:
-        """Groups of controls: what a form needs to show each choice."""
+        """Describe groups of controls: what a form needs to show each choice."""
         return [
             {"title": title, "items": [self._item(k) for k in keys if self._shown(k)]}
             for title, keys in self.groups.items()
@@ -324,9 +324,8 @@ class Choices(param.Parameterized):
             before = scenario.of("input_disturbance", model.n_u)
             scenario = replace(scenario, input_disturbance=before + step)
         if self.step_y:
-            step = piecewise(
-                N, (self._first, np.eye(model.n_y)[self.output] * self.step_y)
-            )
+            change = np.eye(model.n_y)[self.output] * self.step_y
+            step = piecewise(N, (self._first, change))
             before = scenario.of("output_disturbance", model.n_y)
             scenario = replace(scenario, output_disturbance=before + step)
         return scenario
@@ -613,7 +612,7 @@ class GovernorChoices(Choices):
         return replace(scenario, reference=self.reference * scenario.reference)
 
     def designs(self) -> dict[str, Design]:
-        """The governor, and its gain alone."""
+        """Pair the governor with its gain alone."""
         governor, pip = (self.example.designs[name] for name in ("governor", "pip"))
         options = {**governor.options, **self._reading()}
         governor = replace(

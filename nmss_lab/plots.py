@@ -20,6 +20,7 @@ import numpy as np
 from bokeh.layouts import gridplot
 from bokeh.models import (
     ColumnDataSource,
+    CustomJSTickFormatter,
     DataRange1d,
     GridPlot,
     HoverTool,
@@ -40,6 +41,15 @@ STYLES = (
     {"color": "#009E73", "dash": (3, 3), "marker": "triangle"},
 )
 """Colour, dash and marker of each run, in the order in which runs are given."""
+
+TICKS = """
+const size = Math.abs(tick)
+const large = size >= 1e5 || (size > 0 && size < 1e-4)
+const text = large ? tick.toExponential(1).replace(".0e", "e").replace("e+", "e")
+                   : String(Number(tick.toPrecision(6)))
+return text.replace("-", "\u2212")
+"""
+"""Short tick labels, in JavaScript."""
 
 INK, QUIET = "#39424c", "#6b747e"
 DRAWN_POINTS = 1500
@@ -80,7 +90,7 @@ class Chart:
     Parameters
     ----------
     name : str
-        Same for charts that take each other's place.
+        The same for charts that take each other's place.
     title, axis : str
         Heading, and label of the vertical axis with its unit.
     curves : tuple of Curve
@@ -88,8 +98,10 @@ class Chart:
         Drawn in neutral ink, as steps.
     limits : pair of float
         Infinite where there is none.
-    span : pair of float
-        First and last time.
+    samples : array (N,)
+        Times of the samples.
+    unit : str
+        Unit of all times.
     """
 
     name: str
@@ -98,7 +110,13 @@ class Chart:
     curves: tuple[Curve, ...]
     references: tuple[Curve, ...] = ()
     limits: tuple[float, float] = (-np.inf, np.inf)
-    span: tuple[float, float] = (0.0, 1.0)
+    samples: Array = dataclasses.field(default_factory=lambda: np.arange(2.0))
+    unit: str = "s"
+
+    @property
+    def span(self) -> tuple[float, float]:
+        """First and last time."""
+        return float(self.samples[0]), float(self.samples[-1])
 
     @property
     def vertical(self) -> tuple[float, float]:
@@ -143,7 +161,7 @@ def loop_charts(
     in_y, in_u = (_unit(model.units.get(name, "")) for name in (y, u))
     held = [
         ("input", "Input", f"{u}{in_u}", "u"),
-        ("increment", "Change of the input", f"change of {u} a sample{in_u}", "du"),
+        ("increment", "Change of the input a sample", f"\u0394{u}{in_u}", "du"),
     ]
     charts = [
         Chart(
@@ -161,11 +179,9 @@ def loop_charts(
         charts.append(Chart(name, title, axis, curves, limits=limits))
     cost = _curves(runs, lambda run: run.cost)
     active = _curves(runs, lambda run: run.active.sum(axis=1).astype(float))
-    charts.append(Chart("cost", "Cost of the plan", "J [weighted units]", cost))
-    charts.append(
-        Chart("active", "Active limits in the plan", "rows at a limit [-]", active)
-    )
-    return [dataclasses.replace(chart, span=_span(first)) for chart in charts]
+    charts.append(Chart("cost", "Cost of the plan", "J [-]", cost))
+    charts.append(Chart("active", "Active limits in the plan", "number [-]", active))
+    return [_timed(chart, first) for chart in charts]
 
 
 def governor_charts(
@@ -187,26 +203,25 @@ def governor_charts(
     name, governed = next(iter(runs.items()))
     ahead = 0 if getattr(governed.controller, "causal", True) else 1
     model = governed.controller.model
-    y, unit = model.y_names[output], _unit(model.units.get(model.y_names[output], ""))
+    unit = _unit(model.units.get(model.y_names[output], ""))
     t, r, w = governed.t, governed.r[:, output], governed.w[:, output]
     planned_w = governed.trail("w")[:, :, output]
     planned_beta = governed.trail("beta")[:, :, output]
     reference = Chart(
         "reference",
         "Reference r and governed reference w",
-        f"reference of {y}{unit}",
+        f"r, w{unit}",
         (Curve(f"w, {name}", t, w, True, 0, planned_w, ahead),),
         (Curve("reference r", t, r, held=True),),
     )
     beta = Chart(
         "beta",
         "Perturbation of the reference",
-        f"beta = w - r{unit}",
+        f"\u03b2 = w \u2212 r{unit}",
         (Curve(f"beta, {name}", t, w - r, True, 0, planned_beta, ahead),),
         (Curve("zero", t, np.zeros(len(t)), held=True),),
     )
-    span = _span(governed)
-    return [*plain, *(dataclasses.replace(c, span=span) for c in (reference, beta))]
+    return [*plain, *(_timed(chart, governed) for chart in (reference, beta))]
 
 
 def _outputs(runs: Mapping[str, Run], channel: int) -> tuple[Curve, ...]:
@@ -254,8 +269,25 @@ def _sides(run: Run, signal: Any, channel: int) -> tuple[float, float]:
     return float(low[channel]), float(high[channel])
 
 
-def _span(run: Run) -> tuple[float, float]:
-    return float(run.t[0]), float(run.t[-1])
+def _timed(chart: Chart, run: Run) -> Chart:
+    """Chart with times in the unit that suits the length of the run."""
+    seconds = float(run.t[-1])
+    size, unit = next(
+        (size, unit)
+        for size, unit in ((86400.0, "d"), (3600.0, "h"), (60.0, "min"), (1.0, "s"))
+        if seconds >= 8.0 * size or unit == "s"
+    )
+
+    def timed(curves: tuple[Curve, ...]) -> tuple[Curve, ...]:
+        return tuple(dataclasses.replace(c, t=c.t / size) for c in curves)
+
+    return dataclasses.replace(
+        chart,
+        curves=timed(chart.curves),
+        references=timed(chart.references),
+        samples=run.t / size,
+        unit=unit,
+    )
 
 
 def _unit(unit: str) -> str:
@@ -303,42 +335,95 @@ def busiest_sample(runs: Mapping[str, Run]) -> int:
     return int(np.argmax(np.abs(first.r - first.y).max(axis=1)))
 
 
-def pack(charts: Sequence[Chart], t: Array) -> dict[str, Any]:
-    """Gather predictions for a player: one float32 array and a description of it.
+def pack(charts: Sequence[Chart]) -> dict[str, Any]:
+    """Gather all that charts show: one float32 array and a description of it.
 
     Parameters
     ----------
     charts : sequence of Chart
-    t : array (N,)
-        Times of the samples.
+        Over the same samples.
 
     Returns
     -------
     dict
-        "data": t and all trails, one after the other, float32; "samples": N;
-        "charts": for each chart its "name" and "curves" with "style", "held",
-        "ahead", "steps" (Np) and "start", where its trail (N, Np) begins in data.
+        "data": times of the samples, curves and trails, one after the other, float32;
+        "samples": N; "unit" of time; "charts", each with its "name", "title", "axis",
+        "vertical", "span", "limits" (None where there is none), its "lines" and its
+        "trails".
+
+        A line has a "name" (that of its renderer in ``ChartFigure``), and "start" and
+        "size" of its times; its values follow them.  A trail has "style", "held",
+        "ahead", "steps" (Np) and "start", where its (N, Np) values begin.
     """
-    parts, place = [np.asarray(t, np.float32)], len(t)
-    described = []
-    for chart in charts:
-        curves = []
-        for curve in chart.curves:
-            if curve.trail is None:
-                continue
-            curves.append(
-                {
-                    "style": curve.style,
-                    "held": curve.held,
-                    "ahead": curve.ahead,
-                    "steps": curve.trail.shape[1],
-                    "start": place,
-                }
-            )
-            parts.append(curve.trail.astype(np.float32).ravel())
-            place += curve.trail.size
-        described.append({"name": chart.name, "curves": curves})
-    return {"data": np.concatenate(parts), "samples": len(t), "charts": described}
+    box = _Box()
+    t = charts[0].samples
+    box.put(t)
+    described = [
+        {
+            "name": chart.name,
+            "title": chart.title,
+            "axis": chart.axis,
+            "vertical": chart.vertical,
+            "span": chart.span,
+            "limits": [side if np.isfinite(side) else None for side in chart.limits],
+            "lines": _lines(box, chart),
+            "trails": _trails(box, chart),
+        }
+        for chart in charts
+    ]
+    data = np.concatenate(box.parts)
+    unit = charts[0].unit
+    return {"data": data, "samples": len(t), "unit": unit, "charts": described}
+
+
+class _Box:
+    """Arrays one after the other, as float32."""
+
+    def __init__(self) -> None:
+        self.parts: list[Any] = []
+        self.size = 0
+
+    def put(self, values: Array) -> int:
+        """Add an array; return where it begins."""
+        self.parts.append(np.asarray(values, np.float32).ravel())
+        self.size += values.size
+        return self.size - values.size
+
+
+def _lines(box: _Box, chart: Chart) -> list[dict[str, Any]]:
+    """Every renderer's line; empty where the chart has no such curve."""
+    curves: dict[str, Curve | None] = {f"style{i}": None for i in range(len(STYLES))}
+    curves |= {f"style{curve.style}": curve for curve in chart.curves}
+    curves["ink"] = chart.references[0] if chart.references else None
+    lines = []
+    for name, curve in curves.items():
+        t, y = _corners(curve)
+        lines.append({"name": name, "size": t.size, "start": box.put(t)})
+        box.put(y)
+    return lines
+
+
+def _trails(box: _Box, chart: Chart) -> list[dict[str, Any]]:
+    return [
+        {
+            "style": curve.style,
+            "held": curve.held,
+            "ahead": curve.ahead,
+            "steps": curve.trail.shape[1],
+            "start": box.put(curve.trail),
+        }
+        for curve in chart.curves
+        if curve.trail is not None
+    ]
+
+
+def _corners(curve: Curve | None) -> tuple[Array, Array]:
+    """Give times and values of a line; held values become corners."""
+    if curve is None:
+        return np.zeros(0), np.zeros(0)
+    if curve.held:
+        return np.repeat(curve.t, 2)[1:], np.repeat(curve.values, 2)[:-1]
+    return curve.t, curve.values
 
 
 def sentences(run: Run) -> tuple[list[str], Array]:
@@ -377,7 +462,7 @@ def _held_rows(rows: Sequence[Any], model: Any) -> str:
 
 
 def _steps(steps: Sequence[int]) -> str:
-    """Steps in words, runs of neighbours joined: "at step 0 to 2, 5"."""
+    """Say steps in words, runs of neighbours joined: "at step 0 to 2, 5"."""
     runs: list[list[int]] = []
     for step in steps:
         if runs and step <= runs[-1][1] + 1:
@@ -444,6 +529,7 @@ class ChartFigure:
             start=span[0], end=span[1], reset_start=span[0], reset_end=span[1]
         )
         self.figure.yaxis.axis_label = chart.axis
+        self.figure.xaxis.axis_label = f"time [{chart.unit}]"
         self.figure.title.text = chart.title
 
 
@@ -454,14 +540,13 @@ def _empty_figure(name: str, times: Range1d | DataRange1d) -> figure:
         sizing_mode="stretch_both",
         x_range=times,
         y_range=Range1d(-1, 1),
-        x_axis_label="time [s]",
         tools="xbox_zoom,reset,save",
         toolbar_location="above",
         output_backend="canvas",
         background_fill_color=None,
         border_fill_color=None,
         outline_line_color=None,
-        min_border_left=58,
+        min_border_left=62,
         min_border_right=10,
     )
     plot.toolbar.logo = None
@@ -474,6 +559,7 @@ def _empty_figure(name: str, times: Range1d | DataRange1d) -> figure:
         axis.axis_label_text_color = axis.major_label_text_color = INK
         axis.axis_line_color = axis.major_tick_line_color = QUIET
         axis.minor_tick_line_color = None
+        axis.formatter = CustomJSTickFormatter(code=TICKS)
     plot.grid.grid_line_color, plot.grid.grid_line_alpha = "#808890", 0.22
     return plot
 
@@ -488,6 +574,7 @@ def _add_line(plot: figure, source: ColumnDataSource, number: int) -> Any:
         width=2.2,
         line_dash=list(style["dash"]),
         line_join="round",
+        name=f"style{number}",
     )
 
 
@@ -503,14 +590,8 @@ def _limit_line() -> Span:
 
 
 def _fill(source: ColumnDataSource, curve: Curve | None) -> None:
-    """Data of a curve; held values become corners, which hold to the end."""
-    if curve is None:
-        t = y = np.zeros(0)
-    elif curve.held:
-        t, y = np.repeat(curve.t, 2)[1:], np.repeat(curve.values, 2)[:-1]
-    else:
-        t, y = curve.t, curve.values
-    source.data = {"t": np.asarray(t, np.float32), "y": np.asarray(y, np.float32)}
+    t, y = _corners(curve)
+    source.data = {"t": t.astype(np.float32), "y": y.astype(np.float32)}
 
 
 def draw(charts: Sequence[Chart], columns: int = 2) -> GridPlot:

@@ -23,6 +23,8 @@ from nmss_lab.simulate import Run
 HERE = Path(__file__).resolve().parent.parent
 PAGES = (("receding_horizon", "Receding horizon"), ("governor", "Reference governor"))
 
+PARTS = "lead", "alert", "player", "measures", "python", "notes", "controls"
+
 COLUMNS = {
     "rise": "Rise [s]",
     "settling": "Settling [s]",
@@ -68,13 +70,17 @@ class LivePage:
         times = Range1d(*charts[0].span)
         self.figures = {chart.name: ChartFigure(chart, times) for chart in charts}
         start = busiest_sample(self.runs)
-        self.player = Player(run=moving(charts, self._named(), start, True))
-        self.controls = Controls(state=self._state(0))
+        self.player = Player(
+            run=moving(charts, self._named(), start, True), sizing_mode="stretch_width"
+        )
+        self.controls = Controls(
+            form=self._form(), state=self._state(0), sizing_mode="stretch_width"
+        )
         self.controls.param.watch(self._take, "sent")
         self._tell()
 
     def _first_picture(self) -> tuple[dict[str, Run], list[Chart]]:
-        """Runs of the choices, or of the defaults where those cannot be had."""
+        """Run the choices, or the defaults where those cannot be had."""
         try:
             return self._compute()
         except ValueError as error:
@@ -103,10 +109,14 @@ class LivePage:
             self.complaint = ""
         except ValueError as error:
             self.complaint, charts = str(error), []
+        fresh = self.choices.case != case
         if charts:
-            self._show(charts, fresh=self.choices.case != case)
-        self._tell()
+            start = busiest_sample(self.runs)
+            self.player.run = moving(charts, self._named(), start, fresh)
+        if fresh:
+            self.controls.form = self._form()
         self.controls.state = self._state(message)
+        self._tell()
 
     def _accept(self, sent: dict[str, Any]) -> None:
         if sent.pop("reset", False):
@@ -116,20 +126,12 @@ class LivePage:
         else:
             self.choices.accept(sent)
 
-    def _show(self, charts: Sequence[Chart], fresh: bool) -> None:
-        for chart in charts:
-            self.figures[chart.name].show(chart)
-        start = busiest_sample(self.runs)
-        self.player.run = moving(charts, self._named(), start, fresh)
+    def _form(self) -> dict[str, Any]:
+        choices = self.choices
+        return {"groups": choices.description(), "defaults": choices.defaults()}
 
     def _state(self, message: int) -> dict[str, Any]:
-        choices = self.choices
-        return {
-            "groups": choices.description(),
-            "values": choices.values(),
-            "defaults": choices.defaults(),
-            "message": message,
-        }
+        return {"values": self.choices.values(), "message": message}
 
     def _tell(self) -> None:
         """Words around the plots."""
@@ -144,7 +146,7 @@ class LivePage:
         self.notes.object = f"<p>{source}</p><ul>{notes}</ul>"
 
     def template(self) -> pn.Template:
-        """The page, ready to be served."""
+        """Put the page together."""
         page = page_template(
             self.subject.path, self.subject.heading, list(self.figures)
         )
@@ -223,7 +225,8 @@ def _complaint(text: str) -> str:
     if not text:
         return ""
     kept = "The picture still shows the last choices that worked."
-    return f'<div class="wrong"><p>{html.escape(text)}</p><p class="quiet">{kept}</p></div>'
+    words = f'<p>{html.escape(text)}</p><p class="quiet">{kept}</p>'
+    return f'<div class="wrong">{words}</div>'
 
 
 def _measures(runs: Mapping[str, Run], channel: int) -> str:
