@@ -377,6 +377,10 @@ def solve(
         program.H, program.f @ theta, program.M, low - known, high - known, guess
     )
     nothing = np.zeros(program.n_z), np.zeros(len(known))
+    if not len(known):  # some solvers do not take a program without rows
+        free = program.free @ theta
+        residual = kkt_residual(problem, free, nothing[1])
+        return Solution(free, nothing[1], QPStatus.SOLVED, residual=residual)
     try:
         z, multipliers, iterations, infeasible = solver(problem)
     except Exception as error:  # a solver may raise anything; the loop must go on
@@ -491,8 +495,9 @@ def _through_qpsolvers(name: str) -> Backend:
         low, high = np.isfinite(problem.lower), np.isfinite(problem.upper)
         G = np.vstack([problem.M[high], -problem.M[low]])
         h = np.concatenate([problem.upper[high], -problem.lower[low]])
+        rows = (G, h) if len(h) else (None, None)  # some solvers stumble over no rows
         solution = qpsolvers.solve_problem(
-            qpsolvers.Problem(problem.H, problem.f, G, h), solver=name
+            qpsolvers.Problem(problem.H, problem.f, *rows), solver=name
         )
         multipliers = np.zeros(len(problem.lower))
         if solution.found and solution.z is not None:
