@@ -323,6 +323,8 @@ class Controller(ABC):
             vector[layout["estimate"]] = self._estimate_at_rest(y)
         if "integral" in layout and (np.any(y) or np.any(u)):
             vector = self._track(vector, u, np.tile(y, 1 + self.preview))
+            if "w" in layout:  # measuring takes y off, and w is added on applying
+                vector[layout["integral"]] += y
         empty = np.zeros(self.n_z), np.zeros(self.n_theta), np.zeros(self.n_rows)
         return Memory(vector, *empty, np.array(-1), np.array(False))
 
@@ -338,14 +340,15 @@ class Controller(ABC):
         Raises
         ------
         ValueError
-            If r is not finite.
+            If a size does not fit or r is not finite.
         """
-        recipe, layout = self.form.recipe, self.form.recipe.layout
+        recipe, layout, model = self.form.recipe, self.form.recipe.layout, self.model
+        before = memory.vector
+        y, r = _channels("y", y, model.n_y), _channels("r", r, model.n_y)
         if not np.isfinite(r).all():
             raise ValueError(f"r = {r} is not finite")
-        y = np.asarray(y, dtype=float)
-        before = memory.vector
-        v = layout.read(before, "v")[..., 0, :] if v is None else np.asarray(v, float)
+        v = layout.read(before, "v")[..., 0, :] if v is None else v
+        v = _channels("v", v, model.n_v)
         good = np.isfinite(y).all(axis=-1) & np.isfinite(v).all(axis=-1)
         if not good.all():
             y = np.where(np.isfinite(y), y, before @ recipe.forecast.T)
@@ -409,9 +412,17 @@ class Controller(ABC):
             What ``decide`` returned.
         seen : array (..., n_u), optional
             Input that an internal model sees, if not u.
+
+        Raises
+        ------
+        ValueError
+            If a size does not fit or an input is not finite.
         """
         recipe, layout = self.form.recipe, self.form.recipe.layout
-        u = np.asarray(u, dtype=float)
+        u = _channels("u", u, self.model.n_u)
+        seen = u if seen is None else _channels("seen", seen, self.model.n_u)
+        if not (np.isfinite(u).all() and np.isfinite(seen).all()):
+            raise ValueError(f"u = {u}, seen as {seen}, is not finite")
         vector = memory.vector
         if "integral" in layout:
             other = self._overruled(memory, u, move)
@@ -419,9 +430,13 @@ class Controller(ABC):
                 r = np.tile(layout.read(vector, "r"), 1 + self.preview)
                 tracked = self._track(vector, u, r)
                 vector = np.where(other[..., None], tracked, vector)
-        seen = u if seen is None else np.asarray(seen, dtype=float)
         applied = np.concatenate([u, seen, move.governed], axis=-1)
+        sums = vector[..., layout["integral"]] if "w" in layout else None
         vector = vector @ recipe.keep.T + applied @ recipe.store.T
+        if sums is not None:  # w waits where y was refused
+            part = vector[..., layout["integral"]]
+            refused = memory.refused[..., None]
+            vector[..., layout["integral"]] = np.where(refused, sums, part)
         return Memory(
             vector,
             move.decision,
@@ -490,6 +505,14 @@ def signal(name: str, value: Array | None, size: int) -> Array:
     if not np.isfinite(array).all():
         raise ValueError(f"{name} = {array} is not finite")
     return np.broadcast_to(array, (size,)).copy()
+
+
+def _channels(name: str, value: Any, size: int) -> Array:
+    """Signals (..., size) as numbers."""
+    array = np.asarray(value, dtype=float)
+    if array.shape[-1:] != (size,):
+        raise ValueError(f"{name} has shape {array.shape}, expected (..., {size})")
+    return array
 
 
 def _ahead(name: str, given: Array | None, now: Array, steps: int) -> Array:
