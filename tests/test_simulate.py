@@ -1,0 +1,607 @@
+"""What every controller promises in a closed loop, and the loop itself."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from conftest import DECISION, REPLAY
+from strategies import random_model, roll_out
+
+from nmss_lab import qp
+from nmss_lab.controller import Limits, Status
+from nmss_lab.governor import governor
+from nmss_lab.models import DifferenceModel
+from nmss_lab.mpc import STRUCTURES, integral_of_error, wang_young
+from nmss_lab.pip import lq_gain, pip
+from nmss_lab.predict import Horizon
+from nmss_lab.simulate import Scenario, closed_loop, closed_loops, samples
+
+MODEL = DifferenceModel([-1.5, 0.56], [0.1, 0.08], [0.05, 0.02])
+"""Stable, with gain 3 from the input and 1.167 from the disturbance."""
+
+CHANGES_Q = {"Q": 1.0, "R": 0.3}
+SUMS_Q = {"Q": [0.1, 0.1, 0.01, 0.1], "R": 0.1}
+
+ALL = [*STRUCTURES, "governor", "pip", "positional pip", "forward pip"]
+
+
+def build(name, limits=None, model=MODEL, **options):
+    """Return a controller of any structure for ``MODEL``."""
+    limits = limits or Limits()
+    if name == "governor":
+        K = lq_gain(model, SUMS_Q["Q"], SUMS_Q["R"])
+        return governor(model, K, 12, limits, **options)
+    if name.endswith("pip"):
+        K = lq_gain(model, SUMS_Q["Q"], SUMS_Q["R"])
+        law = "positional" if name.startswith("pos") else "incremental"
+        path = "forward" if name.startswith("for") else "feedback"
+        return pip(model, K, limits, law, path)
+    weights = SUMS_Q if name == "integral_of_error" else CHANGES_Q
+    return STRUCTURES[name](
+        model, Horizon(12, 4), limits=limits, **{**weights, **options}
+    )
+
+
+def steps(*levels, each=40):
+    """Return a reference of several levels, ``each`` samples long."""
+    return np.repeat(levels, each)
+
+
+def check_inputs(run, limits, name=""):
+    """Every input and change of it is a number within its limits."""
+    for signal, (low, high) in ((run.u, limits.u), (run.du, limits.du)):
+        assert np.isfinite(signal).all(), name
+        assert (signal >= np.asarray(low) - 1e-12).all(), (name, signal.min())
+        assert (signal <= np.asarray(high) + 1e-12).all(), (name, signal.max())
+
+
+# --- Promise 1 and 2: limits always, never NaN, fallbacks in order -------------------
+
+
+def raising(problem):
+    """Break as a solver may."""
+    raise RuntimeError("out of memory")
+
+
+def numberless(problem):
+    """Answer with NaN."""
+    nothing = np.full(len(problem.f), np.nan)
+    return nothing, np.zeros(len(problem.lower)), 3, False
+
+
+def wrong(problem):
+    """Answer with something that is not optimal."""
+    return np.full(len(problem.f), 7.0), np.zeros(len(problem.lower)), 3, False
+
+
+def giving_up(problem):
+    """Claim that there is no solution."""
+    return None, np.zeros(len(problem.lower)), 3, True
+
+
+def silent(problem):
+    """Give no answer and no reason."""
+    return None, None, 0, False
+
+
+def misshapen(problem):
+    """Answer with a vector of another length."""
+    return np.zeros(len(problem.f) + 1), np.zeros(len(problem.lower)), 0, False
+
+
+BROKEN = [raising, numberless, wrong, giving_up, silent, misshapen]
+LIMITS = Limits(u=(-1.0, 1.0), du=(-0.2, 0.2))
+
+
+@pytest.fixture(params=BROKEN, ids=lambda f: f.__name__)
+def broken(request, monkeypatch):
+    """Register a solver that fails in one of the ways; yield a switch for it."""
+    works = {"now": True}
+
+    def solver(problem):
+        answer = qp._daqp if works["now"] else request.param
+        return answer(problem)
+
+    monkeypatch.setitem(qp.BACKENDS, "broken", solver)
+    return works
+
+
+QP_STRUCTURES = [*STRUCTURES, "governor"]
+
+
+@pytest.mark.parametrize("name", QP_STRUCTURES)
+def test_failing_solver_is_survived_by_the_last_plan(name, broken):
+    """Promise 2: the plan made before the failure is continued, and it says so."""
+    controller = build(name, LIMITS, backend="broken")
+    scenario = Scenario(steps(1.0, -2.0), v=np.zeros(80))
+    seen = []
+    for sample in samples(MODEL.plant(), controller, scenario):
+        broken["now"] = sample.k < 41
+        seen.append(sample)
+    shifted = [s for s in seen if s.move.status == Status.SHIFTED]
+    assert [s.k for s in shifted[:2]] == [42, 43]
+    plan = controller.plan(seen[41].move, "u")[:, 0]
+    for sample in shifted[:5]:
+        assert sample.u[0] == pytest.approx(plan[sample.k - 41], abs=DECISION)
+        assert sample.move.shift == sample.k - 41
+    u = np.array([s.u[0] for s in seen])
+    assert np.isfinite(u).all()
+    assert np.abs(u).max() <= 1.0
+    assert np.abs(np.diff(u, prepend=0.0)).max() <= 0.2 + 1e-12
+
+
+@pytest.mark.parametrize("name", QP_STRUCTURES)
+def test_solver_that_never_worked_leaves_the_input_where_it_is(name, broken):
+    """Promise 2: with no plan to continue, hold."""
+    broken["now"] = False
+    controller = build(name, LIMITS, backend="broken")
+    run = closed_loop(MODEL.plant(), controller, Scenario(steps(2.0), v=np.zeros(40)))
+    assert (run.status == Status.HELD).all()
+    assert not run.u.any()
+    assert np.isfinite(run.cost).all()
+
+
+@pytest.mark.parametrize("name", QP_STRUCTURES)
+def test_loop_recovers_when_the_solver_does(name, broken):
+    """A failure of ten samples does not spoil what follows."""
+    controller = build(name, LIMITS, backend="broken")
+    scenario = Scenario(steps(2.0, each=150), v=np.zeros(150))
+    y = []
+    for sample in samples(MODEL.plant(), controller, scenario):
+        broken["now"] = not 3 <= sample.k < 13
+        y.append(sample.y[0])
+    assert y[-1] == pytest.approx(2.0, abs=0.01)
+
+
+def test_plan_is_shifted_not_restarted_in_the_trail(broken):
+    """The trail of a continued plan starts at the present sample."""
+    controller = build("wang_young", LIMITS, backend="broken")
+    scenario = Scenario(steps(1.0, -2.0), v=np.zeros(80))
+    for sample in samples(MODEL.plant(), controller, scenario):
+        broken["now"] = sample.k < 41
+        if sample.k == 41:
+            fresh = controller.plan(sample.move, "y")
+        if sample.k == 44:
+            shifted = controller.plan(sample.move, "y")
+            break
+    assert shifted[:-3] == pytest.approx(fresh[3:], abs=REPLAY)
+    assert shifted[-3:] == pytest.approx(np.repeat(fresh[-1:], 3, 0), abs=REPLAY)
+
+
+MIXED = DifferenceModel(-0.8 * np.eye(2)[None], np.array([[[0.2], [0.15]]]), dt=1.0)
+"""Two outputs, one input: they cannot be held apart."""
+
+
+def squeezed(outputs, backend="daqp", **more):
+    """Return a run in which an output disturbance makes the limits contradict."""
+    limits = Limits(y=([-1, -1], [1, 1]), outputs=outputs, **more)
+    controller = wang_young(MIXED, Horizon(8, 3), 1.0, 0.1, limits, backend=backend)
+    push = np.zeros((30, 2))
+    push[10:20] = [3.0, -3.0]
+    scenario = Scenario(np.zeros((30, 2)), output_disturbance=push)
+    return closed_loop(MIXED.plant(), controller, scenario)
+
+
+BACKENDS = ["daqp", "proxqp", "qpsolvers/quadprog", "qpsolvers/daqp"]
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_hard_output_limits_are_dropped_and_it_says_so(backend):
+    """Promise 2 (6.1.2): rows go for these samples only; no input limits are left."""
+    run = squeezed("hard", backend)
+    assert (run.status[10:14] == Status.DROPPED).all()
+    assert (run.status[:10] == Status.FREE).all()
+    assert (run.status[25:] == Status.FREE).all()
+    assert np.isfinite(run.u).all()
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_soft_output_limits_are_relaxed_and_it_says_so(backend):
+    """Promise 2: a violation at a price, shared by both outputs."""
+    run = squeezed("soft", backend)
+    assert (run.status[10:14] == Status.SOFTENED).all()
+    worst = np.abs(run.y[11:14]).max(axis=0)
+    assert np.abs(worst[0] - worst[1]) < 1.0
+
+
+PRICED = 1e-5
+"""A violation is made small by a price of 1e6 times the Hessian, not forbidden."""
+
+
+def test_priority_keeps_the_important_output():
+    """Promise 2: the first in rank is kept as soon as it can be, the other is not."""
+    for first, ranks in ((0, (1, 2)), (1, (2, 1))):
+        run = squeezed("priority", priority=ranks)
+        assert (run.status[10:14] == Status.SOFTENED).all()
+        # at 11 the plan still took the push for the plant's own motion
+        assert np.abs(run.y[12:20, first]).max() <= 1.0 + PRICED
+        assert np.abs(run.y[12:20, 1 - first]).max() > 2.0
+
+
+def test_priority_breaks_the_less_important_no_more_than_needed():
+    """The predicted violation of rank 2 is the least that rank 1 allows."""
+    run = squeezed("priority", priority=(1, 2))
+    y = run.trail("y")[10]
+    assert y[:, 0].max() <= 1.0 + PRICED
+    # the input lowers both; holding y1 at its limit is all that is asked of it
+    assert y[-1, 0] == pytest.approx(1.0, abs=1e-3)
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_measurement_that_is_not_a_number_is_refused(name):
+    """Promise 2: it never enters; the loop is back in place soon after."""
+    noise = np.zeros(140)
+    noise[[60, 61, 62]] = np.nan
+    noise[100] = np.inf
+    scenario = Scenario(steps(2.0, each=140), v=np.zeros(140), noise=noise)
+    run = closed_loop(MODEL.plant(), build(name, LIMITS), scenario)
+    told = run.status[[60, 61, 62, 100]]
+    assert np.isin(told, [Status.REFUSED, Status.HELD]).all()
+    check_inputs(run, LIMITS, name)
+    # at rest, a gap in the measurement is no reason to move
+    clean = closed_loop(
+        MODEL.plant(), build(name, LIMITS), dataclasses.replace(scenario, noise=None)
+    )
+    assert np.abs(run.y - clean.y).max() < 0.02, name
+    assert run.y[-1, 0] == pytest.approx(2.0, abs=0.01)
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_gap_during_a_step_does_not_spoil_the_loop(name):
+    """Promise 2: refused from the very first sample, and in the transient."""
+    noise = np.zeros(150)
+    noise[[0, 1, 5, 6, 7]] = np.nan
+    scenario = Scenario(steps(1.0, each=150), v=np.zeros(150), noise=noise)
+    run = closed_loop(MODEL.plant(), build(name, LIMITS), scenario)
+    check_inputs(run, LIMITS, name)
+    assert run.y[-1, 0] == pytest.approx(1.0, abs=0.01)
+
+
+@pytest.mark.parametrize("name", ["disturbance_direct", "disturbance_augmented"])
+def test_disturbance_that_is_not_a_number_is_refused(name):
+    """Promise 2 for the measured disturbance."""
+    controller = build(name, LIMITS)
+    memory = controller.start()
+    memory = controller.measure(memory, [0.5], [1.0], [2.0])
+    memory = controller.apply(memory, [0.1], controller.decide(memory))
+    memory = controller.measure(memory, [0.6], [1.0], [np.nan])
+    move = controller.decide(memory)
+    assert move.status in (Status.REFUSED, Status.HELD)
+    assert np.isfinite(memory.vector).all()
+    assert controller.form.recipe.layout.read(memory.vector, "v")[0] == [2.0]
+
+
+def test_reference_that_is_not_a_number_is_an_error():
+    """It comes from the user, not from a sensor."""
+    controller = build("wang_young")
+    with pytest.raises(ValueError, match="r = .* is not finite"):
+        controller.measure(controller.start(), [0.0], [np.nan], [0.0])
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_input_outside_its_limits_comes_back_at_the_allowed_rate(name):
+    """Promise 1: where level and rate contradict, the rate wins."""
+    u0 = np.array([2.0])
+    limits = Limits(u=(-1.0, 1.0), du=(-0.2, 0.2))
+    scenario = Scenario(np.zeros(60), v=np.zeros(60), u0=u0, y0=np.array([6.0]))
+    run = closed_loop(MODEL.plant(), build(name, limits), scenario)
+    assert np.abs(run.du).max() <= 0.2 + 1e-12
+    assert run.u[:5, 0] == pytest.approx([1.8, 1.6, 1.4, 1.2, 1.0], abs=DECISION)
+    assert (run.u[5:] <= 1.0 + 1e-12).all()
+    assert not np.isin(run.status, [Status.SHIFTED, Status.HELD]).any()
+
+
+def test_limits_are_kept_in_two_hundred_random_runs():
+    """Promises 1, 2 and 4 for random models, structures, limits and disturbances."""
+    names = ["integral_of_error", "wang_young", "disturbance_direct"]
+    for seed in range(200):
+        rng = np.random.default_rng(seed)
+        p, q = rng.integers(1, 3, 2)
+        model = random_model(rng, p, q, 1, 2, 2, 1, radius=rng.uniform(0.3, 1.0))
+        high, rate = rng.uniform(0.1, 1.0, q), rng.uniform(0.05, 0.5, q)
+        limits = Limits(
+            u=(-high, 2 * high),
+            du=(-rate, rate),
+            y=(-1.0, rng.uniform(0.5, 3.0)) if seed % 2 else (-np.inf, np.inf),
+            outputs=["hard", "soft", "priority"][seed % 3],
+        )
+        controller = STRUCTURES[names[seed % len(names)]](
+            model, Horizon(6, 3), 1.0, 0.1, limits
+        )
+        scenario = Scenario(
+            np.repeat(rng.uniform(-3, 3, (2, p)), 5, 0),
+            v=rng.standard_normal((10, 1)),
+            noise=0.1 * rng.standard_normal((10, p)),
+            output_disturbance=np.repeat(rng.standard_normal((2, p)), 5, 0),
+        )
+        run = closed_loop(model.plant(), controller, scenario)
+        check_inputs(run, limits, f"seed {seed}")
+        told = [Status(code) for code in np.unique(run.status)]
+        assert max(told) <= Status.DROPPED, f"seed {seed}: {told}"
+
+
+# --- Promise 3: no wind-up, bumpless -------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_actuator_that_saturates_causes_no_wind_up(name):
+    """Promise 3: after 100 samples at the end stop it leaves it at once."""
+    scenario = Scenario(
+        np.repeat([9.0, 1.0], [100, 60]), v=np.zeros(160), actuator=(-1.0, 1.0)
+    )
+    run = closed_loop(MODEL.plant(), build(name), scenario)
+    assert run.u[99, 0] == 1.0
+    back = np.argmax(run.u[100:, 0] < 1.0)
+    assert back <= 1, f"{name}: {back} samples late"
+    assert np.abs(run.y[-15:] - 1.0).max() < 0.05
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_manual_to_automatic_is_bumpless(name):
+    """Promise 3: at rest where the hand left it, the controller sees no reason to move."""
+    manual = np.full(120, np.nan)
+    manual[:80] = 0.7
+    r = np.full(120, 3.0 * 0.7)
+    r[:70] = -4.0  # far away while the hand is on
+    scenario = Scenario(r, v=np.zeros(120), manual=manual)
+    run = closed_loop(MODEL.plant(), build(name), scenario)
+    assert (run.u[:80] == 0.7).all()
+    # the plant is within 1e-6 of rest, so a bump of 1e-3 is three orders above it
+    assert np.abs(run.u[80:] - 0.7).max() < 1e-3, name
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_switching_on_at_rest_is_bumpless(name):
+    """Starting from a constant past that is not zero."""
+    u0, y0 = np.array([0.5]), np.array([1.5])
+    scenario = Scenario(np.full(20, 1.5), v=np.zeros(20), u0=u0, y0=y0)
+    run = closed_loop(MODEL.plant(), build(name, LIMITS), scenario)
+    assert np.abs(run.u - 0.5).max() < DECISION, name
+    assert np.abs(run.y - 1.5).max() < DECISION, name
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_input_that_cannot_be_applied_is_an_error(name):
+    """Nothing that is not a number enters the memory."""
+    controller = build(name)
+    memory = controller.measure(controller.start(), [0.0], [1.0], [0.0])
+    move = controller.decide(memory)
+    with pytest.raises(ValueError, match="u = .* is not finite"):
+        controller.apply(memory, [np.nan], move)
+
+
+# --- The loop ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_loop_applies_the_equation_of_the_plant(name, rng):
+    """Outputs are those of (7.1) for inputs, disturbances and loads that were applied."""
+    N = 30
+    scenario = Scenario(
+        steps(1.0, each=N),
+        v=rng.standard_normal((N, 1)),
+        input_disturbance=rng.standard_normal((N, 1)),
+        output_disturbance=rng.standard_normal((N, 1)),
+        noise=rng.standard_normal((N, 1)),
+    )
+    run = closed_loop(MODEL.plant(), build(name), scenario)
+    into = list(run.u + scenario.input_disturbance)
+    y = [np.zeros(1), *roll_out(MODEL, [np.zeros(1)], [], [], into, list(scenario.v))]
+    wanted = np.array(y[:N]) + scenario.output_disturbance
+    assert run.y == pytest.approx(wanted, abs=REPLAY)
+    assert run.measured == pytest.approx(wanted + scenario.noise, abs=REPLAY)
+    assert run.du[1:] == pytest.approx(np.diff(run.u, axis=0), abs=REPLAY)
+    assert run.t.tolist() == list(range(N))
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_design_is_not_changed_by_use(name, rng):
+    """Same design, two runs, and two loops in turns: the same numbers."""
+    controller = build(name, LIMITS)
+    v = rng.standard_normal(60)
+    one, two = (
+        Scenario(steps(1, -1, each=30), v=v),
+        Scenario(steps(-2, 2, each=30), v=v),
+    )
+    first = [closed_loop(MODEL.plant(), controller, each) for each in (one, two)]
+    fresh = closed_loop(MODEL.plant(), build(name, LIMITS), one)
+    turns = zip(
+        samples(MODEL.plant(), controller, one),
+        samples(MODEL.plant(), controller, two),
+        strict=True,
+    )
+    for a, b in turns:
+        assert a.u == pytest.approx(first[0].u[a.k], abs=REPLAY)
+        assert b.u == pytest.approx(first[1].u[b.k], abs=REPLAY)
+    assert fresh.u == pytest.approx(first[0].u, abs=REPLAY)
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_samples_give_what_the_whole_run_gives(name, rng):
+    """The generator and the bulk form are one loop."""
+    controller = build(name, LIMITS)
+    scenario = Scenario(steps(1, -2), v=rng.standard_normal(80))
+    run = closed_loop(MODEL.plant(), controller, scenario)
+    taken = list(samples(MODEL.plant(), controller, scenario))
+    for field in ("y", "u", "measured"):
+        found = np.array([getattr(s, field) for s in taken])
+        assert found == pytest.approx(getattr(run, field), abs=REPLAY)
+    for field in ("status", "cost", "active", "w"):
+        found = np.array([getattr(s.move, field) for s in taken]) * 1.0
+        assert found == pytest.approx(getattr(run, field) * 1.0, abs=REPLAY)
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_ensemble_in_lock_step_equals_single_runs(name, rng):
+    """Each plant of an ensemble runs as if it were alone."""
+    controller = build(name, LIMITS)
+    noise = 0.05 * rng.standard_normal(50)
+    noise[20] = np.nan
+    scenario = Scenario(steps(1, -2, each=25), v=rng.standard_normal(50), noise=noise)
+    plants = [MODEL.varied(f).plant() for f in (0.8, 1.0, 1.3)]
+    together = closed_loops(plants, controller, scenario, keep_moves=True)
+    for plant, found in zip(plants, together, strict=True):
+        alone = closed_loop(plant, controller, scenario)
+        for field in ("y", "u", "du", "w", "status", "cost"):
+            pair = getattr(found, field) * 1.0, getattr(alone, field) * 1.0
+            assert pair[0] == pytest.approx(pair[1], abs=DECISION), field
+        if hasattr(controller, "signals"):
+            assert found.trail("y") == pytest.approx(alone.trail("y"), abs=DECISION)
+
+
+def test_plant_of_the_users_own_kind(rng):
+    """Anything with reset, output and step will do."""
+
+    class Tank:
+        n_y, n_u, n_v, dt = 1, 1, 0, 1.0
+
+        def reset(self, u0, v0, y0=None):
+            return 0.0
+
+        def output(self, state):
+            return np.array([state])
+
+        def step(self, state, u, v):
+            return 0.9 * state + 0.1 * u[0]
+
+    model = DifferenceModel([-0.9], [0.1])
+    controller = wang_young(model, Horizon(10, 3), 1.0, 0.1, LIMITS)
+    scenario = Scenario(steps(0.5))
+    own = closed_loop(Tank(), controller, scenario)
+    ours = closed_loop(model.plant(), controller, scenario)
+    assert own.u == pytest.approx(ours.u, abs=REPLAY)
+
+
+def test_trail_starts_where_the_loop_goes():
+    """Without surprises the next output is the first one that was predicted."""
+    controller = build("wang_young", LIMITS)
+    scenario = Scenario(steps(1.0), v=np.zeros(40))
+    run = closed_loop(MODEL.plant(), controller, scenario)
+    trail = run.trail("y")
+    assert trail.shape == (40, 12, 1)
+    assert trail[:-1, 0] == pytest.approx(run.y[1:], abs=DECISION)
+    assert run.trail("u")[:, 0] == pytest.approx(run.u, abs=DECISION)
+    assert run.trail("du")[:, 0] == pytest.approx(run.du, abs=DECISION)
+
+
+def test_active_rows_are_those_at_their_limit():
+    """The rows reported are equalities."""
+    controller = build("wang_young", LIMITS)
+    run = closed_loop(MODEL.plant(), controller, Scenario(steps(2.0), v=np.zeros(40)))
+    labels = controller.program.labels
+    assert run.active.any()
+    for k, row in np.argwhere(run.active):
+        name, channel, step = labels[row]
+        value = run.trail(name)[k, step, channel]
+        edge = 1.0 if name == "u" else 0.2
+        assert abs(value) == pytest.approx(edge, abs=DECISION)
+
+
+def test_preview_moves_before_the_reference_does():
+    """Only the previewing design reads ahead."""
+    scenario = Scenario(np.repeat([0.0, 1.0], 20), v=np.zeros(40))
+    moved = {}
+    for reading in ("held", "next", "preview"):
+        controller = build("wang_young", reference=reading)
+        run = closed_loop(MODEL.plant(), controller, scenario)
+        moved[reading] = int(np.argmax(np.abs(run.u[:, 0]) > 1e-9))
+    assert moved == {"held": 20, "next": 19, "preview": 8}
+
+
+def test_status_is_told_in_sentences():
+    """Counts and words of what happened."""
+    run = closed_loop(
+        MODEL.plant(), build("pip", LIMITS), Scenario(steps(2.0), v=np.zeros(40))
+    )
+    assert sum(int(each.split()[0]) for each in run.sentences) == 40
+    assert any("clipped" in each for each in run.sentences)
+
+
+# --- Errors --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"v": np.zeros(9)}, "v has 9 samples, expected 10"),
+        ({"noise": np.zeros((4, 1))}, "noise has 4 samples"),
+        ({"input_disturbance": np.full(10, np.nan)}, "input_disturbance is not finite"),
+        ({"reference": np.full(10, np.inf)}, "reference is not finite at sample 0"),
+        ({"reference": np.zeros((2, 3, 4))}, "reference has shape"),
+    ],
+)
+def test_scenario_with_a_mistake_is_refused(fields, message):
+    """The series at fault is named."""
+    with pytest.raises(ValueError, match=message):
+        Scenario(**{"reference": np.zeros(10), **fields})
+
+
+@pytest.mark.parametrize(
+    ("plant", "scenario", "message"),
+    [
+        (MIXED.plant(), Scenario(np.zeros((9, 2))), "plant has 2 outputs and 1 inputs"),
+        (
+            DifferenceModel([-0.5], [1.0], [1.0], dt=0.1).plant(),
+            Scenario(np.zeros(9)),
+            "sampled every 0.1 s",
+        ),
+        (DifferenceModel([-0.5], [1.0]).plant(), Scenario(np.zeros(9)), "0 measured"),
+        (MODEL.plant(), Scenario(np.zeros((9, 2))), "reference has 2 columns"),
+        (MODEL.plant(), Scenario(np.zeros(9), v=np.zeros((9, 2))), "v has 2 columns"),
+    ],
+)
+def test_parts_that_do_not_fit_are_refused(plant, scenario, message):
+    """Plant, controller and scenario must have the same sizes."""
+    with pytest.raises(ValueError, match=message):
+        closed_loop(plant, build("disturbance_direct"), scenario)
+
+
+def test_ensemble_of_different_sizes_is_refused():
+    """Lock step needs equal shapes."""
+    controller = build("wang_young")
+    scenario = Scenario(np.zeros(5), v=np.zeros(5))
+    with pytest.raises(ValueError, match="plants is empty"):
+        closed_loops([], controller, scenario)
+    with pytest.raises(ValueError, match="plants differ"):
+        closed_loops([MODEL.plant(), MIXED.plant()], controller, scenario)
+
+
+def test_trail_of_a_controller_without_predictions_is_refused():
+    """PIP predicts nothing; MPC predicts no "beta"."""
+    scenario = Scenario(np.zeros(5), v=np.zeros(5))
+    with pytest.raises(ValueError, match="no predictions"):
+        closed_loop(MODEL.plant(), build("pip"), scenario).trail("y")
+    with pytest.raises(ValueError, match="predicts u, du, y"):
+        closed_loop(MODEL.plant(), build("wang_young"), scenario).trail("beta")
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda c, m: c.measure(m, np.zeros(3), [0.0], [0.0]), "y has shape"),
+        (lambda c, m: c.measure(m, [0.0], np.zeros(3), [0.0]), "r has shape"),
+        (lambda c, m: c.measure(m, [0.0], [0.0], np.zeros(3)), "v has shape"),
+        (lambda c, m: c.decide(m, r=np.zeros((1, 3))), "r has shape"),
+        (lambda c, m: c.apply(m, np.zeros(3), c.decide(m)), "u has shape"),
+        (lambda c, m: c.start(y0=np.zeros(2)), "y0 has shape"),
+        (lambda c, m: c.start(u0=[np.nan]), "u0 = .* is not finite"),
+    ],
+)
+def test_vectors_of_the_wrong_size_are_refused(call, message):
+    """Each argument is named with its shape."""
+    controller = build("disturbance_direct")
+    memory = controller.measure(controller.start(), [0.0], [0.0], [0.0])
+    with pytest.raises(ValueError, match=message):
+        call(controller, memory)
+
+
+def test_integral_of_error_alone_holds_its_sum(rng):
+    """The sum of the error in the memory is the sum of the error of the run."""
+    controller = integral_of_error(MODEL, Horizon(6, 3), 1.0, 1.0, LIMITS)
+    scenario = Scenario(steps(0.5), v=np.zeros(40), noise=rng.standard_normal(40))
+    layout = controller.form.recipe.layout
+    total = 0.0
+    for sample in samples(MODEL.plant(), controller, scenario):
+        total += 0.5 - sample.measured[0]
+        held = layout.read(sample.memory.vector, "integral")[0]
+        assert held == pytest.approx(total, abs=REPLAY)
