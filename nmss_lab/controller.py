@@ -349,7 +349,8 @@ class Controller(ABC):
             raise ValueError(f"r = {r} is not finite")
         v = layout.read(before, "v")[..., 0, :] if v is None else v
         v = _channels("v", v, model.n_v)
-        good = np.isfinite(y).all(axis=-1) & np.isfinite(v).all(axis=-1)
+        numbers = np.isfinite(y).all(axis=-1) & np.isfinite(v).all(axis=-1)
+        good = np.asarray(numbers)
         if not good.all():
             y = np.where(np.isfinite(y), y, before @ recipe.forecast.T)
             v = np.where(np.isfinite(v), v, layout.read(before, "v")[..., 0, :])
