@@ -1,5 +1,7 @@
 """Predictions of every structure against a step-by-step simulation with plain loops."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from conftest import ALGEBRA
@@ -52,7 +54,7 @@ def blocks(vector, size):
 
 
 def planned_u(model, horizon, z, last, moves):
-    """Inputs over the horizon from the decision, written out."""
+    """Return the inputs over the horizon that a decision stands for."""
     free, u = blocks(z, model.n_u), []
     for i in range(horizon.Np):
         if moves == "u":
@@ -64,8 +66,8 @@ def planned_u(model, horizon, z, last, moves):
 
 
 def check_inputs(c, z, known, u, last):
-    """The signals u and du are what the decision says."""
-    du = [u[0] - last, *(b - a for a, b in zip(u[:-1], u[1:], strict=True))]
+    """Compare the signals u and du with what the decision says."""
+    du = [u[0] - last, *(b - a for a, b in pairwise(u))]
     assert relative(c.signals["u"].value(z, known), np.concatenate(u)) <= ALGEBRA
     assert relative(c.signals["du"].value(z, known), np.concatenate(du)) <= ALGEBRA
 
@@ -135,7 +137,7 @@ INCREMENTAL = {
 
 
 def check_incremental(c, h, z, y, S, Q, R):
-    """Outputs, inputs and the cost of a structure that decides changes."""
+    """Compare outputs, inputs and the cost of a structure that decides changes."""
     model, horizon = c.model, c.horizon
     u = planned_u(model, horizon, z, h.u[-1], "du")
     check_inputs(c, z, h.known, u, h.u[-1])

@@ -274,7 +274,7 @@ def test_disturbance_that_is_not_a_number_is_refused(name):
 def test_reference_that_is_not_a_number_is_an_error():
     """It comes from the user, not from a sensor."""
     controller = build("wang_young")
-    with pytest.raises(ValueError, match="r = .* is not finite"):
+    with pytest.raises(ValueError, match=r"r = .* is not finite"):
         controller.measure(controller.start(), [0.0], [np.nan], [0.0])
 
 
@@ -338,7 +338,7 @@ def test_actuator_that_saturates_causes_no_wind_up(name):
 
 @pytest.mark.parametrize("name", ALL)
 def test_manual_to_automatic_is_bumpless(name):
-    """Promise 3: at rest where the hand left it, the controller sees no reason to move."""
+    """Promise 3: at rest where the hand left it, there is no reason to move."""
     manual = np.full(120, np.nan)
     manual[:80] = 0.7
     r = np.full(120, 3.0 * 0.7)
@@ -366,7 +366,7 @@ def test_input_that_cannot_be_applied_is_an_error(name):
     controller = build(name)
     memory = controller.measure(controller.start(), [0.0], [1.0], [0.0])
     move = controller.decide(memory)
-    with pytest.raises(ValueError, match="u = .* is not finite"):
+    with pytest.raises(ValueError, match=r"u = .* is not finite"):
         controller.apply(memory, [np.nan], move)
 
 
@@ -375,7 +375,7 @@ def test_input_that_cannot_be_applied_is_an_error(name):
 
 @pytest.mark.parametrize("name", ALL)
 def test_loop_applies_the_equation_of_the_plant(name, rng):
-    """Outputs are those of (7.1) for inputs, disturbances and loads that were applied."""
+    """Outputs are those of (7.1) for the inputs, disturbances and loads applied."""
     N = 30
     scenario = Scenario(
         steps(1.0, each=N),
