@@ -15,6 +15,7 @@ ORDER = [
     "records",
     "models",
     "continuous",
+    "identify",
     "nmss",
     "predict",
     "qp",
