@@ -256,7 +256,7 @@ K_MARGINAL = pole_gain(MARGINAL, [0.0, 0.0, 0.2, 0.2])
 
 
 def test_governor_without_active_limits_leaves_the_reference_alone(rng):
-    """beta = 0, w = r, and the loop is that of the positional PIP law."""
+    """No perturbation, w = r, and the loop is that of the positional PIP law."""
     limits = Limits(u=(-50.0, 50.0), du=(-20.0, 20.0))
     case = Scenario(levels(rng, 60, 1))
     governed = governor(MARGINAL, K_MARGINAL, 10, limits)
