@@ -26,12 +26,13 @@ export function render({ model, el }) {
   let painted = () => {}
   const open = {}
   const update = {}    // name -> function that shows a value
-  const form = element("form", { class: "controls", "aria-label": "Choices" })
+  const form = element("form", { class: "choices", "aria-label": "Choices" })
   form.addEventListener("submit", (event) => event.preventDefault())
   el.append(form)
 
   const latency = []   // of the latest answers: milliseconds from choice to picture
-  window.nmssForm = { latency }  // for tests and measurements
+  const idle = () => waiting === null && !changed
+  window.nmssForm = { latency, idle }  // for tests and measurements
 
   const send = () => {
     if (waiting !== null) { changed = true; return }

@@ -8,6 +8,8 @@ from panel.viewable import Viewable
 from apps.pages import governor, receding_horizon
 from apps.pages.live import page_template, text_style
 
+THREADS = 4
+
 INDEX = """
 <h1>Predictive control, live</h1>
 <p>Every plot answers while you move a slider, and every run can be played: see the
@@ -32,7 +34,12 @@ def index() -> pn.Template:
 
 
 def pages() -> dict[str, Callable[[], Viewable]]:
-    """Builders of all pages by path; the empty path is the index."""
+    """Give the builders of all pages by path; the empty path is the index.
+
+    Choices are worked on in a few threads, so that one session's long run does not
+    keep the others waiting.
+    """
+    pn.config.nthreads = THREADS
     return {
         "": index,
         "receding_horizon": receding_horizon.page,

@@ -95,7 +95,7 @@ export function render({ model, el }) {
   const [fan, fanLabel] = check("fan", "Past plans", false)
   const status = document.getElementById("status")
   el.append(
-    element("div", { class: "player", role: "group", "aria-label": "Player" },
+    element("div", { class: "playbar", role: "group", "aria-label": "Player" },
       element("div", { class: "buttons" },
         button("first", "To the start (Home)", () => { play(false); go(0) }),
         button("back", "One sample back (left arrow)", () => step(-1)),
@@ -254,7 +254,7 @@ export function render({ model, el }) {
   const draw = (moment) => {
     frame = 0
     if (playing) {
-      time += (moment - before) / 1000 * Number(speed.value)
+      time += Math.max(moment - before, 0) / 1000 * Number(speed.value)
       before = moment
       if (time >= last()) {
         if (loop.checked) time = 0
@@ -270,6 +270,7 @@ export function render({ model, el }) {
     statistics.frames += 1
     statistics.sample = k
     statistics.playing = playing
+    statistics.steps = run.charts.flatMap((chart) => chart.trails.map((t) => t.steps))
     if (playing) request()
   }
   const request = () => { if (!frame) frame = requestAnimationFrame(draw) }

@@ -28,6 +28,13 @@ DIVERGED = 1e9
 
 MOST_RUNS = 3
 
+OPENS_WITH = {
+    "ifac93_6_3_3": ("wang_young", "forward_path"),
+    "marginally_stable_6_3_2": ("wang_young", "forward_path"),
+    "shell_5_3_2": ("wang_young", "integral_of_error_b"),
+}
+"""Structures that cases of chapters 5 and 6 compare."""
+
 
 @functools.cache
 def known_case(name: str) -> Case:
@@ -485,7 +492,7 @@ class LoopChoices(Choices):
         "Limits": ("limit_u", "u_max", "limit_du", "du_max", "limit_y", "y_max"),
         "Plant and disturbances": ("gain", "dynamics", "step_u", "step_y", "step_at"),
     }
-    default_case: ClassVar[str] = "governor_3_4"
+    default_case: ClassVar[str] = "ifac93_6_3_3"
 
     def take_case(self, name: str) -> None:
         """Choose a case: its predictive designs, and the horizons of the first."""
@@ -494,7 +501,7 @@ class LoopChoices(Choices):
         self.structures, self.param["structures"].objects = [], predictive
         self._predictive = predictive
         super().take_case(name)
-        self.structures = _first_choice(predictive)
+        self.structures = list(OPENS_WITH.get(name) or _first_choice(predictive))
         horizon = self._main_design.horizon
         self.Np, self.Nc = horizon.Np, horizon.Nc
 
@@ -675,9 +682,14 @@ def _case_title(example: Case) -> str:
 
 
 def _first_choice(predictive: list[str]) -> list[str]:
-    """Structures a page opens with."""
-    wanted = [n for n in ("wang_young", "integral_of_error") if n in predictive]
-    return wanted or predictive[:2]
+    """Structures a case opens with: the two that differ most in it."""
+    for pair in (
+        ("disturbance_direct", "wang_young"),
+        ("wang_young", "integral_of_error"),
+    ):
+        if set(pair) <= set(predictive):
+            return list(pair)
+    return predictive[:2]
 
 
 def _finite_sides(sides: tuple[Any, Any]) -> list[Any]:

@@ -102,6 +102,8 @@ class Chart:
         Times of the samples.
     unit : str
         Unit of all times.
+    counts : bool
+        Whether values are whole numbers.
     """
 
     name: str
@@ -112,6 +114,7 @@ class Chart:
     limits: tuple[float, float] = (-np.inf, np.inf)
     samples: Array = dataclasses.field(default_factory=lambda: np.arange(2.0))
     unit: str = "s"
+    counts: bool = False
 
     @property
     def span(self) -> tuple[float, float]:
@@ -127,6 +130,8 @@ class Chart:
         """
         values = np.concatenate([c.values for c in (*self.curves, *self.references)])
         low, high = float(values.min()), float(values.max())
+        if self.counts:
+            low, high = 0.0, max(high, 1.0)
         size = max(high - low, 1e-9 * (1.0 + abs(high)))
         near = [x for x in self.limits if low - 2 * size <= x <= high + 2 * size]
         low, high = min([low, *near]), max([high, *near])
@@ -512,6 +517,8 @@ class ChartFigure:
             mode="mouse",
         )
         self.figure.add_tools(hover)
+        if chart.counts:
+            self.figure.yaxis[0].ticker.min_interval = 1
         self.show(chart)
 
     def show(self, chart: Chart) -> None:
