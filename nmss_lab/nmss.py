@@ -14,7 +14,6 @@ from typing import Literal
 
 import numpy as np
 import scipy.linalg
-import scipy.signal
 
 from nmss_lab.models import (
     Array,
@@ -260,7 +259,7 @@ def minimal_form(
     ----------
     model : DifferenceModel
     observer : "deadbeat" or "kalman"
-        Poles placed close to the origin, or the steady-state Kalman filter in current
+        All poles at the origin, or the steady-state Kalman filter in current
         form for white noise of the given variances on the input's change and on the
         measured outputs.
     process_noise, measurement_noise : float
@@ -283,9 +282,7 @@ def minimal_form(
         return observed_form(model, A, B, C, current, A @ current)
     if observer != "deadbeat":
         raise ValueError(f'observer = "{observer}": expected "deadbeat" or "kalman"')
-    wanted = np.linspace(-0.1, 0.1, A.shape[0] + 2)[1:-1]
-    placed = scipy.signal.place_poles(A.T, C.T, wanted)
-    return observed_form(model, A, B, C, np.zeros_like(C.T), placed.gain_matrix.T)
+    return observed_form(model, A, B, C, np.zeros_like(C.T), _deadbeat(A, C))
 
 
 def observed_form(
@@ -325,6 +322,45 @@ def observed_form(
     zeros = np.zeros((n, model.n_y))
     names = tuple(f"x{i + 1}" for i in range(n))
     return Form(A, B, C, zeros, np.zeros((n, 0)), "du", recipe, names)
+
+
+def _deadbeat(A: Array, C: Array) -> Array:
+    """Gain L (n_x, n_y) that makes A - L C nilpotent, for an observable pair.
+
+    Luenberger's canonical form: with the columns q_i that only the last row of chain i
+    sees, L maps C A^{nu_i - 1} q_i to A^{nu_i} q_i.  Placing distinct poles near the
+    origin instead asks for nearly parallel eigenvectors, and for gains up to 1e4.
+    """
+    chains = _chains(A, C)
+    ends = np.cumsum([len(chain) for chain in chains]) - 1
+    seen_last = np.linalg.inv(np.vstack(chains))[:, ends]
+    moved = np.column_stack(
+        [
+            np.linalg.matrix_power(A, len(chain) - 1) @ q
+            for chain, q in zip(chains, seen_last.T, strict=True)
+        ]
+    )
+    gain: Array = A @ moved @ np.linalg.inv(C @ moved)
+    return gain
+
+
+def _chains(A: Array, C: Array) -> list[Array]:
+    """Rows c_i, c_i A, ... of each output i that are independent, (nu_i, n_x) each."""
+    chains: list[list[Array]] = [[] for _ in C]
+    following, growing = list(C), list(range(len(C)))
+    basis = np.zeros((0, A.shape[0]))
+    while growing:
+        for i in tuple(growing):
+            rest = following[i] / np.linalg.norm(following[i])
+            rest = rest - basis.T @ (basis @ rest)
+            size = np.linalg.norm(rest)
+            if size < 1e-6:
+                growing.remove(i)
+                continue
+            basis = np.vstack([basis, rest / size])
+            chains[i].append(following[i])
+            following[i] = following[i] @ A
+    return [np.array(chain) for chain in chains]
 
 
 def _kalman(A: Array, B: Array, C: Array, q: float, r: float) -> Array:
