@@ -51,8 +51,6 @@ def _form_3_1() -> Iterator[Claim]:
         "the state of (3.2) has (n+1)p + m(q-1) entries; here for (5.7)",
         (n + 1) * p + m * (q - 1),
         size,
-        0,
-        "a count",
         because="past inputs are m - 1 vectors of q entries: (n+1)p + (m-1)q",
     )
     listed = n + (m - 1) + 1
@@ -62,8 +60,6 @@ def _form_3_1() -> Iterator[Claim]:
         "the vector listed in (3.2) has n + (m-1) + 1 blocks; here for (5.7), p = q",
         listed * p,
         size,
-        0,
-        "a count",
         erratum="E3.2",
     )
 

@@ -200,8 +200,6 @@ def _ifac93_4() -> Iterator[Claim]:
         "the benchmark is of 7th order",
         7,
         len(case.continuous.poles()) if case.continuous else 0,
-        0,
-        "a count",
     )
     run = nominal("ifac93_4_4_2", "integral_of_error")
     first = steps(run)[0]

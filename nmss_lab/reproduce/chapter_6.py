@@ -521,8 +521,6 @@ def _ifac93_6() -> Iterator[Claim]:
         "no unstable realisation",
         0,
         forward.unstable,
-        0,
-        "a count",
         note=f"largest radius {forward.radii.max():.3f}",
     )
     yield claim(
@@ -588,8 +586,6 @@ def _figure_6_7(before: Robust) -> Iterator[Claim]:
         "all design objectives are satisfied; here: no unstable realisation",
         0,
         after.unstable,
-        0,
-        "a count",
         erratum="E6.4",
     )
 

@@ -39,8 +39,6 @@ def _forms_7() -> Iterator[Claim]:
         "G_Delta,1 has np + (m-1)q rows; here those that the augmented state adds",
         n * p + (m - 1) * q,
         added,
-        0,
-        "a count",
         because="they are the past disturbances, lr; see E7.3",
     )
     blocks = built(case.designs["disturbance_direct"]).knowledge.layout.shapes["dv"]
@@ -50,8 +48,6 @@ def _forms_7() -> Iterator[Claim]:
         "l + 1 blocks of changes enter the prediction when v is held",
         model.ng + 1,
         blocks[0],
-        0,
-        "a count",
         because="the changes vanish from i = l on, so l blocks suffice",
     )
 
@@ -201,8 +197,6 @@ def _temperature_model() -> Iterator[Claim]:
         "n = 1, m = 3, l = 3",
         (1, 3, 3),
         (model.na, model.nb, model.ng),
-        0,
-        "counts",
     )
     yield unchecked(
         "7.4.2.2",

@@ -45,6 +45,7 @@ ERRATA: dict[str, str] = {
 
 
 YES_NO = "a statement: yes or no"
+COUNT = "a count"
 
 
 PRINTED = "half a unit of the last printed digit"
@@ -107,12 +108,10 @@ def table(rows: Sequence[Claim]) -> str:
 
 def _block(row: Claim) -> str:
     head = f"{row.where:<16} {row.name}"
-    values = (
-        f"printed {_text(row.printed)}, ours {_text(row.ours)}, "
-        f"tolerance {row.tolerance:.3g} ({row.reason})"
-    )
-    rest = f"{row.explanation}" if row.explanation else ""
-    lines = [row.statement, values, f"=> {row.verdict}", rest]
+    values = f"printed {_text(row.printed)}, ours {_text(row.ours)}"
+    if math.isfinite(row.tolerance):
+        values += f", tolerance {row.tolerance:.3g} ({row.reason})"
+    lines = [row.statement, values, f"=> {row.verdict}", row.explanation]
     wrapped = (
         textwrap.wrap(line, 84, initial_indent="    ", subsequent_indent="    ")
         for line in lines
@@ -152,7 +151,7 @@ def claim(
     printed: Any,
     ours: Any,
     tolerance: float = 0.0,
-    reason: str = YES_NO,
+    reason: str = "",
     erratum: str = "",
     because: str = "",
     note: str = "",
@@ -176,7 +175,7 @@ def claim(
         printed,
         ours,
         float(tolerance),
-        reason,
+        reason or (YES_NO if isinstance(printed, bool) else COUNT),
         verdict,
         explanation.strip(),
     )
