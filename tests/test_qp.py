@@ -221,7 +221,8 @@ def test_indefinite_block_is_accepted_when_the_sum_is_positive(rng):
     identity = Affine(np.eye(2), np.zeros((2, 1)))
     negative = Cost(identity, np.diag([1.0, -0.5]))
     p = assemble([negative, Cost(identity, np.eye(2))], [])
-    assert np.linalg.eigvalsh(p.H) == pytest.approx([0.5, 2.0])
+    smallest, largest = np.linalg.eigvalsh(p.H)
+    assert (smallest, largest) == pytest.approx((0.5, 2.0))
 
 
 def test_indefinite_sum_is_refused_with_its_eigenvalue():
