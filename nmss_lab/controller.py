@@ -322,7 +322,8 @@ class Controller(ABC):
         if "estimate" in layout:
             vector[layout["estimate"]] = self._estimate_at_rest(y)
         if "integral" in layout and (np.any(y) or np.any(u)):
-            vector = self._track(vector, u, np.tile(y, 1 + self.preview))
+            asked = self._free_move(vector, np.tile(y, 1 + self.preview))
+            vector = self._tracked(vector, u - asked)
             if "w" in layout:  # measuring takes y off, and w is added on applying
                 vector[layout["integral"]] += y
         empty = np.zeros(self.n_z), np.zeros(self.n_theta), np.zeros(self.n_rows)
@@ -426,11 +427,7 @@ class Controller(ABC):
             raise ValueError(f"u = {u}, seen as {seen}, is not finite")
         vector = memory.vector
         if "integral" in layout:
-            other = self._overruled(memory, u, move)
-            if other.any():
-                r = np.tile(layout.read(vector, "r"), 1 + self.preview)
-                tracked = self._track(vector, u, r)
-                vector = np.where(other[..., None], tracked, vector)
+            vector = self._tracked(vector, self._missed(memory, u, move))
         applied = np.concatenate([u, seen, move.governed], axis=-1)
         sums = vector[..., layout["integral"]] if "w" in layout else None
         vector = vector @ recipe.keep.T + applied @ recipe.store.T
@@ -447,11 +444,16 @@ class Controller(ABC):
             memory.refused,
         )
 
-    def _overruled(self, memory: Memory, u: Array, move: Move) -> Array:
-        """Loops (...) in which the sum of the error must follow the applied input."""
-        missed = np.abs(u - move.u).max(axis=-1)
-        overruled: Array = missed > 1e-9 * (1.0 + np.abs(u).max(axis=-1))
-        return overruled
+    def _missed(self, memory: Memory, u: Array, move: Move) -> Array:
+        """By how much the sum of the error must move the law, (..., n_u).
+
+        Zero while the decided input is applied; else the way from what the law without
+        limits asks for to the applied input, so that nothing winds up.
+        """
+        size = 1e-9 * (1.0 + np.abs(u).max(axis=-1, keepdims=True))
+        other = np.abs(u - move.u).max(axis=-1, keepdims=True) > size
+        r = np.tile(self.form.recipe.layout.read(memory.vector, "r"), 1 + self.preview)
+        return np.where(other, u - self._free_move(memory.vector, r), 0.0)
 
     def clip(self, u: Array, before: Array) -> Array:
         """Nearest input within the limits, given the one before.
@@ -467,13 +469,17 @@ class Controller(ABC):
         """u_{k-1} (..., n_u) from a memory vector."""
         return self.form.recipe.layout.read(vector, "u")[..., 0, :]
 
-    def _track(self, vector: Array, u: Array, r: Array) -> Array:
-        """Set the sum of the error so that the law without limits asks for ``u``."""
+    def _free_move(self, vector: Array, r: Array) -> Array:
+        """Input that the law without limits asks for, r_k, r_{k+1}, ... in one row."""
         on_memory, on_r = self.free_law()
-        integral = self.form.recipe.layout["integral"]
-        wanted = u - vector @ on_memory.T - r @ on_r.T
+        free: Array = vector @ on_memory.T + r @ on_r.T
+        return free
+
+    def _tracked(self, vector: Array, missed: Array) -> Array:
+        """Change the sum of the error so that the law moves by ``missed``."""
         tracked = np.array(vector)
-        tracked[..., integral] += wanted @ self._integral_inverse.T
+        integral = self.form.recipe.layout["integral"]
+        tracked[..., integral] += missed @ self._integral_inverse.T
         return tracked
 
     @cached_property

@@ -8,12 +8,12 @@ as the limits allow:
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 
-from nmss_lab.controller import Limits, Memory, Move
+from nmss_lab.controller import Limits, Memory, Move, Status
 from nmss_lab.models import Array, DifferenceModel, Numbers
 from nmss_lab.nmss import Layout, integral_of_error_form
 from nmss_lab.pip import gain
@@ -59,6 +59,26 @@ class ReferenceGovernor(PredictiveController):
     def governs_ahead(self) -> int:
         """0 when w_k is chosen at k, 1 when w_{k+1} is."""
         return int(not self.causal)
+
+    def _missed(self, memory: Memory, u: Array, move: Move) -> Array:
+        """Way from what the gain asks for under the governed reference, to ``u``."""
+        x = memory.vector @ self.form.recipe.state.T
+        if self.causal:
+            x = x + move.governed @ self.form.D.T
+        return np.where(memory.refused[..., None], 0.0, u + x @ self.K.T)
+
+    def _decide(self, memory: Memory, r: Array, v: Array) -> Move:
+        if self.causal:
+            return super()._decide(memory, r, v)
+        # No decision moves u_k: plan from the input that the actuator will allow.
+        asked = -memory.vector @ self.form.recipe.state.T @ self.K.T
+        missed = self.clip(asked, self.last_input(memory.vector)) - asked
+        missed[memory.refused] = 0.0
+        vector = self._tracked(memory.vector, missed)
+        move = super()._decide(replace(memory, vector=vector), r, v)
+        cut = np.abs(missed).max(axis=-1) > 1e-6
+        move.status[cut & (move.status < Status.CLIPPED)] = Status.CLIPPED
+        return move
 
     def _finish(self, move: Move, memory: Memory) -> Move:
         w = self.plan(move, "w")[:, 0]

@@ -62,12 +62,10 @@ class StateFeedback(Controller):
             shift=np.full(loops, -1),
         )
 
-    def _overruled(self, memory: Memory, u: Array, move: Move) -> Array:
-        """Loops in which the input differs from what the law itself asked for."""
-        on_memory, _ = self.free_law()
-        missed = np.abs(u - memory.vector @ on_memory.T).max(axis=-1)
-        overruled: Array = (missed > 1e-9) & self.anti_windup
-        return overruled
+    def _missed(self, memory: Memory, u: Array, move: Move) -> Array:
+        """Way from what the law asked for to the applied input, unless windup is on."""
+        asked = self._free_move(memory.vector, np.zeros_like(move.w))
+        return np.where(self.anti_windup, u - asked, 0.0)
 
 
 def pip(
