@@ -231,12 +231,15 @@ class PredictiveController(Controller):
         self, theta: Array, bounds: tuple[Array, Array], guess: Guess | None
     ) -> tuple[Solution, Status]:
         """Solve with all rows; if that fails let rows give way as the limits say."""
-        if self.limits.outputs == "soft" and self._giving.size:
-            return self._solve_relaxed(theta, bounds)
+        governed = (self.ranks == 0).any()
+        if self.limits.outputs == "soft" and self._soft.size:
+            solution, status = self._solve_relaxed(theta, bounds)
+            if solution.found or not governed:
+                return solution, status
         solution = solve(self.program, theta, self.backend, bounds, guess)
         if solution.found or not self._giving.size:
             return solution, Status.LIMITED
-        if self.limits.outputs == "priority" or (self.ranks == 0).any():
+        if self.limits.outputs == "priority" or governed:
             return self._solve_by_rank(theta, bounds)
         return self._solve_without(theta, bounds)
 
@@ -263,9 +266,14 @@ class PredictiveController(Controller):
         return _cut(solution, self.n_z, multipliers), Status.DROPPED
 
     @cached_property
+    def _soft(self) -> Array:
+        """Rows with a price; the inputs of a governed loop (rank 0) have none."""
+        return np.flatnonzero(self.ranks > 0)
+
+    @cached_property
     def _relaxed(self) -> QuadraticProgram:
-        weight = np.full(self._giving.size, self.limits.soft_weight)
-        return self.program.softened(self._giving, weight)
+        weight = np.full(self._soft.size, self.limits.soft_weight)
+        return self.program.softened(self._soft, weight)
 
     def _solve_relaxed(
         self, theta: Array, bounds: tuple[Array, Array]
