@@ -44,6 +44,7 @@ export function render({ model, el }) {
     }
     waiting = ++sent
     model.sent = { ...values, message: waiting }
+    delete values.reset
   }
 
   const choose = (name, value) => {

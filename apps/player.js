@@ -342,7 +342,7 @@ export function render({ model, el }) {
 
   model.on("run", () => {
     run = model.run
-    for (const chart of run.charts) fill(chart, views[chart.name])
+    for (const chart of run.charts) if (views[chart.name]) fill(chart, views[chart.name])
     described = -1
     time = run.fresh ? run.start : Math.min(time, last())
     words()

@@ -321,10 +321,9 @@ def test_playing_moves_the_picture_and_asks_nobody(visit: Open, path: str) -> No
     page = visit(f"{path}?{QUICK}")
     settled(page)
     page.evaluate(
-        "window.sentFrames = 0;"
-        "const send = WebSocket.prototype.send;"
-        "WebSocket.prototype.send = function (...a)"
-        " { window.sentFrames += 1; return send.apply(this, a) }"
+        "() => { window.sentFrames = 0; const send = WebSocket.prototype.send;"
+        " WebSocket.prototype.send = function (...a)"
+        " { window.sentFrames += 1; return send.apply(this, a) } }"
     )
     before = picture(page)
     page.get_by_role("button", name="Play").click()
@@ -370,7 +369,7 @@ def test_player_loops_and_stops(visit: Open) -> None:
 def test_link_restores_the_choices(visit: Open, path: str) -> None:
     """The address of a changed page opens the same page again."""
     page = visit(f"{path}?{QUICK}")
-    slide(page, "Np", "min")
+    slide(page, "Np", "max")
     page.locator("select[name=limit_u]").select_option('"own"')
     settled(page)
     slide(page, "gain", "max")
@@ -378,7 +377,7 @@ def test_link_restores_the_choices(visit: Open, path: str) -> None:
     address = page.evaluate("location.pathname.slice(1) + location.search")
     measured = page.locator(".text-measures table").inner_text()
     again = visit(address)
-    for name, value in (("Np", "1"), ("gain", "50")):
+    for name, value in (("Np", "80"), ("gain", "50")):
         expect(again.locator(f"input[name={name}]")).to_have_value(value)
     expect(again.locator("select[name=limit_u]")).to_have_value('"own"')
     expect(again.locator(".text-measures table")).to_have_text(
@@ -388,8 +387,10 @@ def test_link_restores_the_choices(visit: Open, path: str) -> None:
 
 def test_wrong_link_is_explained(visit: Open) -> None:
     """An address with impossible choices opens a page that says so."""
-    page = visit(f"receding_horizon?{QUICK}&Np=9999&case2=1")
-    expect(page.get_by_text("In the address of this page")).to_be_visible()
+    for wrong in (f"{QUICK}&Np=9999&unknown=1", f"{QUICK}&Np=2&Nc=9", "case=none"):
+        page = visit(f"receding_horizon?{wrong}")
+        expect(page.get_by_role("alert")).to_contain_text("address of this page")
+        expect(page.locator(".text-measures tbody tr")).to_have_count(2)
 
 
 def test_impossible_design_shows_a_message(visit: Open) -> None:

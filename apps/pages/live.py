@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import logging
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -20,10 +21,15 @@ from nmss_lab.measures import table
 from nmss_lab.plots import Chart, ChartFigure, busiest_sample
 from nmss_lab.simulate import Run
 
+LOG = logging.getLogger(__name__)
 HERE = Path(__file__).resolve().parent.parent
 PAGES = (("receding_horizon", "Receding horizon"), ("governor", "Reference governor"))
 
 PARTS = "lead", "alert", "player", "measures", "python", "notes", "controls"
+
+ADDRESS = "In the address of this page: "
+FAULT = "These choices met a fault in the program; it has been logged."
+KEPT = "The picture still shows the last choices that worked."
 
 COLUMNS = {
     "rise": "Rise [s]",
@@ -78,17 +84,16 @@ class LivePage:
         )
         self.controls.param.watch(self._take, "sent")
         self._tell()
+        self._measure()
 
     def _first_picture(self) -> tuple[dict[str, Run], list[Chart]]:
-        """Run the choices, or the defaults where those cannot be had."""
+        """Run the choices of the address, or the case as it is if they cannot be."""
         try:
             return self._compute()
         except ValueError as error:
-            self.complaint = self.complaint or str(error)
-            chosen, self.choices = self.choices, self.subject.choices()
-            picture = self._compute()
-            self.choices = chosen
-            return picture
+            self.complaint = self.complaint or f"{ADDRESS}{error}"
+            self.choices.take_case(self.choices.case)
+            return self._compute()
 
     def _compute(self) -> tuple[dict[str, Run], list[Chart]]:
         runs = self.choices.runs()
@@ -108,15 +113,20 @@ class LivePage:
             self.runs, charts = self._compute()
             self.complaint = ""
         except ValueError as error:
-            self.complaint, charts = str(error), []
+            self.complaint, charts = f"{error}\n{KEPT}", []
+        except Exception:  # the form waits for an answer, whatever happens
+            LOG.exception("choices %s", self.choices.values())
+            self.complaint, charts = f"{FAULT}\n{KEPT}", []
         fresh = self.choices.case != case
         if charts:
             start = busiest_sample(self.runs)
             self.player.run = moving(charts, self._named(), start, fresh)
         if fresh:
             self.controls.form = self._form()
-        self.controls.state = self._state(message)
         self._tell()
+        if charts:
+            self._measure()
+        self.controls.state = self._state(message)
 
     def _accept(self, sent: dict[str, Any]) -> None:
         if sent.pop("reset", False):
@@ -138,12 +148,14 @@ class LivePage:
         example, look = self.choices.example, self.subject.look
         self.lead.object = _paragraph(look.get(example.name, example.title + "."))
         self.alert.object = _complaint(self.complaint)
-        if not self.complaint:
-            self.measures.object = _measures(self._named(), self.choices.output)
-            self.python.object = f"<pre>{html.escape(self.choices.script())}</pre>"
         notes = "".join(f"<li>{html.escape(note)}</li>" for note in example.notes)
         source = html.escape(f"Section {example.section}. {example.source}.")
         self.notes.object = f"<p>{source}</p><ul>{notes}</ul>"
+
+    def _measure(self) -> None:
+        """Show table and Python of the runs."""
+        self.measures.object = _measures(self._named(), self.choices.output)
+        self.python.object = f"<pre>{html.escape(self.choices.script())}</pre>"
 
     def template(self) -> pn.Template:
         """Put the page together."""
@@ -162,7 +174,7 @@ class LivePage:
             page.add_panel(name, getattr(self, name))
         for name, drawn in self.figures.items():
             pane = pn.pane.Bokeh(drawn.figure, sizing_mode="stretch_both")
-            page.add_panel(name, pane)
+            page.add_panel(f"chart_{name}", pane)
         return page
 
 
@@ -213,7 +225,7 @@ def _from_address(choices: Choices) -> str:
     try:
         choices.accept(given)
     except ValueError as error:
-        return f"In the address of this page: {error}"
+        return f"{ADDRESS}{error}"
     return ""
 
 
@@ -222,11 +234,8 @@ def _paragraph(text: str) -> str:
 
 
 def _complaint(text: str) -> str:
-    if not text:
-        return ""
-    kept = "The picture still shows the last choices that worked."
-    words = f'<p>{html.escape(text)}</p><p class="quiet">{kept}</p>'
-    return f'<div class="wrong">{words}</div>'
+    words = "".join(f"<p>{html.escape(line)}</p>" for line in text.splitlines())
+    return f'<div class="wrong">{words}</div>' if text else ""
 
 
 def _measures(runs: Mapping[str, Run], channel: int) -> str:

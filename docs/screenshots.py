@@ -1,0 +1,68 @@
+"""Take the pictures of the live pages that the README shows.
+
+Run it from a checkout with the test environment: ``python docs/screenshots.py``.
+It serves the pages on a free port and writes one PNG a page beside this file.  Set
+the variable CHROMIUM to the browser to use; chromium or google-chrome otherwise.
+"""
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+from playwright.sync_api import Page, sync_playwright
+
+HERE = Path(__file__).resolve().parent
+VIEWS = {"receding_horizon": ("", 24, True), "governor": ("", 34, False)}
+"""Page: choices in its address, sample shown, whether past plans are drawn."""
+
+
+def serve() -> tuple[subprocess.Popen[str], str]:
+    """Start the server; return its process and address."""
+    command = [sys.executable, "-m", "nmss_lab.cli", "serve", "--port", "0"]
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, text=True, cwd=HERE.parent
+    )
+    assert process.stdout is not None
+    found = re.search(r"http://\S+/", process.stdout.readline())
+    if not found:
+        raise RuntimeError("the server gave no address")
+    return process, found[0]
+
+
+def take(page: Page, url: str, name: str) -> None:
+    """Open a page, play it to the chosen sample, and keep the picture."""
+    choices, sample, past = VIEWS[name]
+    page.goto(f"{url}{name}{choices}")
+    page.wait_for_function("window.nmssPlayer?.frames > 0")
+    page.get_by_role("slider", name="Sample").fill(str(sample))
+    if past:
+        page.get_by_label("Past plans").check()
+    page.mouse.move(0, 0)
+    page.wait_for_timeout(1000)
+    page.screenshot(path=HERE / f"{name}.png")
+
+
+def main() -> None:
+    """Take all pictures."""
+    process, url = serve()
+    chromium = os.environ.get("CHROMIUM") or shutil.which("chromium")
+    chromium = chromium or shutil.which("google-chrome")
+    try:
+        with sync_playwright() as playwright:
+            browser = playwright.chromium.launch(
+                executable_path=chromium, args=["--no-sandbox"]
+            )
+            page = browser.new_page(viewport={"width": 1440, "height": 900})
+            for name in VIEWS:
+                take(page, url, name)
+            browser.close()
+    finally:
+        process.terminate()
+        process.wait()
+
+
+if __name__ == "__main__":
+    main()
