@@ -613,7 +613,8 @@ def gasifier_6_3_4() -> Case:
     integral = dataclasses.replace(
         design,
         structure="integral_of_error",
-        Q=state_weight(model, Q, 0.0, 1e-3 * Q),
+        horizon=Horizon(80, 7),
+        Q=state_weight(model, Q, 0.0, 0.01 * Q),
         reference="zero",
     )
     swing = 0.1 * np.sin(2.0 * np.pi * np.arange(300) / 25.0)
@@ -645,7 +646,7 @@ def gasifier_6_3_4() -> Case:
             "and the printed horizons are kept as a design of their own.",
             "Limits of Table 6.2 are levels; the signals here are deviations from the "
             "operating point at 100 % load.",
-            "The integral-of-error design is our addition.",
+            "The integral-of-error design, with Np = 80, is our addition.",
         ),
         bands={
             "allowed": (
