@@ -143,13 +143,18 @@ def lq_cost(A: Array, B: Array, Q: Array, R: Array) -> Array:
     ValueError
         If the Riccati equation has no stabilising solution.
     """
+    problem = (
+        "the LQ problem has no stabilising solution: an unstable mode is not reached "
+        "by the input or not seen by the weights"
+    )
     try:
         P: Array = scipy.linalg.solve_discrete_are(A, B, Q, R)
     except (np.linalg.LinAlgError, ValueError) as error:
-        raise ValueError(
-            "the LQ problem has no stabilising solution: an unstable mode is not "
-            f"reached by the input or not seen by the weights ({error})"
-        ) from error
+        raise ValueError(f"{problem} ({error})") from error
+    K = np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
+    largest = float(np.abs(np.linalg.eigvals(A - B @ K)).max())
+    if largest > 1.0 - 1e-7:  # rounding may hide a mode on the unit circle
+        raise ValueError(f"{problem} (largest pole {largest:.6f})")
     return P
 
 
