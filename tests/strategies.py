@@ -154,11 +154,13 @@ def play(
     offset: float = 0.0,
     r_ahead: np.ndarray | None = None,
     v_ahead: np.ndarray | None = None,
+    own: bool = False,
 ) -> History:
     """Feed a controller random inputs, references, disturbances and outputs.
 
     The outputs are random too, or those of the model plus ``offset`` when they are to
-    be ``consistent``.  The inputs count as the controller's own decisions.  The last
+    be ``consistent``.  The inputs count as the controller's own decisions, and with
+    ``own`` they are (a governor tells its gain's input from any other).  The last
     sample is measured and decided; ``known`` is its theta for the future given
     (without the present value).
     """
@@ -176,6 +178,8 @@ def play(
         u.append(rng.standard_normal(model.n_u))
         w.append(rng.standard_normal(model.n_y))
         move = controller.decide(memory)
+        if own:
+            u[-1], w[-1] = move.u, move.governed
         move = dataclasses.replace(move, u=u[-1], governed=w[-1])
         memory = controller.apply(memory, u[-1], move)
     ahead_r = None if r_ahead is None else np.vstack([r[-1], r_ahead])

@@ -227,7 +227,7 @@ def test_governor(model, Np, reading, options, seed):
     K = lq_gain(model, 1.0, 0.5)
     c = governor(model, K, Np, Limits(u=(-1e6, 1e6)), reading, **options)
     future = rng.standard_normal((Np, p)) if reading == "preview" else None
-    h = play(c, rng, r_ahead=future)
+    h = play(c, rng, r_ahead=future, own=True)
     z = rng.standard_normal(c.n_z)
     beta = [b * options.get("decay", 1.0) ** i for i, b in enumerate(blocks(z, p))]
     beta += [np.zeros(p)] * (Np - len(beta))
