@@ -10,7 +10,7 @@ import json
 import os
 import signal
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -93,7 +93,57 @@ def _reproduce(arguments: argparse.Namespace) -> None:
 
 
 def _simulate(arguments: argparse.Namespace) -> None:
-    raise ValueError("simulate is not available in this version")
+    """List the cases, or run one and print its notes, measures and moves."""
+    cases = importlib.import_module("nmss_lab.cases")
+    if arguments.case is None:
+        for name in cases.CASES:
+            case = cases.case(name)
+            print(f"{name:<28}{case.title}\n{'':<28}{', '.join(case.designs)}")
+        return
+    case = cases.case(arguments.case)
+    names = [arguments.structure] if arguments.structure else list(case.designs)
+    if names[0] not in case.designs:
+        known = ", ".join(case.designs)
+        raise ValueError(f'structure "{names[0]}": this case has {known}')
+    if arguments.csv and len(names) > 1:
+        raise ValueError("--csv writes one run: name it with --structure")
+    closed_loop = importlib.import_module("nmss_lab.simulate").closed_loop
+    runs = {
+        name: closed_loop(case.plant, case.designs[name].build(), case.scenario)
+        for name in names
+    }
+    _print_runs(case, runs)
+    if arguments.csv:
+        _write_run(runs[names[0]], arguments.csv)
+
+
+def _print_runs(case: Any, runs: Mapping[str, Any]) -> None:
+    measures = importlib.import_module("nmss_lab.measures")
+    print(case.title, *case.notes, sep="\n- ")
+    for channel, name in enumerate(case.model.y_names):
+        print(f"\n{name}")
+        rows = measures.table(runs, channel)
+        print(_line(rows[0]))
+        for row in rows:
+            print(_line(v if isinstance(v, str) else f"{v:.5g}" for v in row.values()))
+    for name, run in runs.items():
+        print(f"\n{name}", *run.sentences, sep="\n- ")
+
+
+def _line(cells: Iterable[str]) -> str:
+    first, *rest = cells
+    return f"{first:<24}" + "".join(f"{cell:>12}" for cell in rest)
+
+
+def _write_run(run: Any, file: str) -> None:
+    records = importlib.import_module("nmss_lab.records")
+    model = run.controller.model
+    names = {"y": model.y_names, "u": model.u_names}
+    if model.n_v:
+        names["v"] = model.v_names
+    units = {"time": "s", **model.units}
+    v = run.v if model.n_v else run.v[:, :0]
+    records.Record(run.t, run.y, run.u, v, run.r, names, units).to_csv(file)
 
 
 def _serve(arguments: argparse.Namespace) -> None:

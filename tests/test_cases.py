@@ -2,6 +2,7 @@
 
 import itertools
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,9 +10,11 @@ from conftest import ALGEBRA
 
 from nmss_lab import cases
 from nmss_lab.analysis import linear_loop
+from nmss_lab.cli import main
 from nmss_lab.controller import Status
 from nmss_lab.models import minimal_realisation
 from nmss_lab.nmss import _deadbeat, differenced_form
+from nmss_lab.records import Record
 from nmss_lab.simulate import closed_loop
 
 DESIGNS = [
@@ -236,3 +239,52 @@ def test_deadbeat_observers_are_gentle(name: str) -> None:
     after = np.linalg.matrix_power(A - L @ C, len(A))
     assert np.abs(after).max() < ALGEBRA
     assert np.abs(L).max() < 5.0
+
+
+# The command
+
+
+def test_simulate_lists_the_cases(capsys: pytest.CaptureFixture[str]) -> None:
+    """Without a name every case is listed with its designs."""
+    assert main(["simulate"]) == 0
+    text = capsys.readouterr().out
+    assert all(name in text for name in cases.CASES)
+    assert "forward_path_optimised" in text
+
+
+def test_simulate_prints_measures(capsys: pytest.CaptureFixture[str]) -> None:
+    """A table for each output, and how the moves came about."""
+    assert main(["simulate", "governor_3_4", "--structure", "governor"]) == 0
+    text = capsys.readouterr().out
+    assert "82.75" in text
+    assert "of 60: A limit is active" in text
+
+
+def test_simulate_writes_a_record(tmp_path: Path) -> None:
+    """The file opens as a record with names and units, and holds the run."""
+    file = str(tmp_path / "run.csv")
+    case, design = "temperature_7_4_2", "disturbance_direct"
+    assert main(["simulate", case, "--structure", design, "--csv", file]) == 0
+    model = cases.case(case).model
+    record = Record.from_csv(
+        file, y=model.y_names, u=model.u_names, v=model.v_names, time="time"
+    )
+    assert record.y.shape == (800, 2)
+    assert record.dt == pytest.approx(360.0)
+    assert record.units["inlet"] == "degC"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["nowhere"], "expected one of governor_3_4"),
+        (["shell_5_3_2", "--structure", "pip"], "this case has integral_of_error"),
+        (["shell_5_3_2", "--csv", "x.csv"], "name it with --structure"),
+    ],
+)
+def test_simulate_says_what_is_wrong(
+    capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
+) -> None:
+    """Mistakes end with exit code 1 and one sentence."""
+    assert main(["simulate", *arguments]) == 1
+    assert message in capsys.readouterr().err
