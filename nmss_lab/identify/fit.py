@@ -1,0 +1,371 @@
+r"""Least squares and refined instrumental variables on a record.
+
+The model of one output is a transfer function with a common denominator,
+
+.. math:: A(z^{-1})\, x_k = \sum_i B_i(z^{-1})\, u_{i,k}, \qquad
+          y_k = x_k + \xi_k
+
+with :math:`B_i = z^{-n_{k,i}} (b_0 + b_1 z^{-1} + \dots)`.  ``sriv`` is right for white
+noise :math:`\xi` and stays consistent for any; ``riv`` also models
+:math:`\xi = (D / C)\, e`.  Young, Biometrika 63 (1976); Young, *Recursive Estimation
+and Time-Series Analysis* (2011).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import get_args
+
+import numpy as np
+from scipy.signal import lfilter
+
+from nmss_lab.identify.estimate import Estimate
+from nmss_lab.identify.noise import fit_noise
+from nmss_lab.identify.structure import (
+    ONE,
+    Noise,
+    Orders,
+    Start,
+    delayed,
+    input_names,
+    inputs_of,
+    is_stable,
+    stabilised,
+)
+from nmss_lab.models import Array
+from nmss_lab.records import Record
+
+CONVERGED = 1e-8
+"""Change of the parameters at which the passes stop, as a share of the largest, each
+weighted by the size of what it multiplies."""
+
+FREE = 50
+"""Bound on the passes of refined instrumental variables."""
+
+GUARDED = 150
+"""Bound on the steps that follow where those passes do not settle."""
+
+GUARDED_CONVERGED = 1e-6
+"""Change at which those steps stop; they settle more slowly."""
+
+HALVINGS = 40
+"""How often a guarded step is halved."""
+
+
+WHITE = Noise(0)
+"""White noise."""
+
+
+def least_squares(record: Record, orders: Orders, start: Start = "rest") -> Estimate:
+    """Fit the equation itself; biased by any noise on the output.
+
+    Parameters
+    ----------
+    record : Record
+        One output; inputs u, then measured disturbances v.  Detrended.
+    orders : Orders
+    start : Start
+
+    Raises
+    ------
+    ValueError
+        If the record does not fit the orders, is too short, or an input is constant.
+    """
+    work = Work.of(record, orders, start)
+    p = work.ordinary()
+    e = work.y[work.first :] - work.plain @ p
+    return work.estimate(p, work.plain, e, "least squares", 1, "", ONE, ONE)
+
+
+def sriv(record: Record, orders: Orders, start: Start = "rest") -> Estimate:
+    """Simplified refined instrumental variables, iterated to convergence.
+
+    Each pass filters everything by 1 / A and takes the output of the model of the pass
+    before as instruments.  Unstable passes are reflected into the unit circle; passes
+    that do not settle at a stable model go on as guarded Gauss-Newton steps to the same
+    end.  A result that still is unstable or has not settled says so in ``problem``.
+
+    Parameters and errors are those of ``least_squares``.
+    """
+    work = Work.of(record, orders, start)
+    p, passes, problem = work.settle(work.ordinary(), WHITE)
+    return work.finish(p, "sriv", passes, problem, ONE, ONE)
+
+
+def riv(
+    record: Record, orders: Orders, noise: Noise, start: Start = "rest"
+) -> Estimate:
+    """Refined instrumental variables with a model of the noise, started from ``sriv``.
+
+    Parameters
+    ----------
+    noise : Noise
+        Fitted to the residuals in every pass, see ``fit_noise``.
+    record, orders, start : see ``least_squares``
+    """
+    work = Work.of(record, orders, start)
+    begin, _, _ = work.settle(work.ordinary(), WHITE)
+    p, passes, problem = work.settle(begin, noise)
+    c, d = fit_noise(work.residuals(p), noise)
+    return work.finish(p, "riv", passes, problem, c, d)
+
+
+@dataclass(frozen=True, eq=False)
+class Work:
+    """Data and regressors of one fit."""
+
+    record: Record
+    orders: Orders
+    start: Start
+    y: Array
+    inputs: Array
+    first: int
+
+    @classmethod
+    def of(cls, record: Record, orders: Orders, start: Start) -> Work:
+        """Check the record against the orders."""
+        inputs, y = inputs_of(record), record.y
+        _check(record, orders, start)
+        first = orders.reach if start == "skip" else 0
+        unknown = orders.count + (orders.reach if start == "estimate" else 0)
+        if len(y) - first < 2 * unknown:
+            raise ValueError(
+                f"{len(y)} samples are too few for the {unknown} unknowns of {orders} "
+                f'with start = "{start}"'
+            )
+        return cls(record, orders, start, y[:, 0], inputs, first)
+
+    @property
+    def nuisance(self) -> int:
+        """Coefficients of the response to what went before the first sample."""
+        return self.orders.reach if self.start == "estimate" else 0
+
+    @cached_property
+    def impulse(self) -> Array:
+        """Unit impulse at the first sample, through which the past acts."""
+        impulse = np.zeros(len(self.y))
+        impulse[0] = 1.0
+        return impulse
+
+    @cached_property
+    def plain(self) -> Array:
+        """Regressors of the equation as it is."""
+        return self.rows(self.y, self.inputs, self.impulse)
+
+    @cached_property
+    def size(self) -> Array:
+        """Size of what each parameter multiplies: frees the passes from the units."""
+        return _norms(self.plain)
+
+    def rows(self, y: Array, inputs: Array, impulse: Array) -> Array:
+        """Regressors (N - first, count + nuisance)."""
+        extra = [delayed(impulse, i) for i in range(self.nuisance)]
+        rows = self.orders.regressors(y, inputs)
+        return np.column_stack([rows, *extra])[self.first :]
+
+    def ordinary(self) -> Array:
+        """Least squares on the equation."""
+        scaled = self.plain / self.size
+        p, *_ = np.linalg.lstsq(scaled, self.y[self.first :], rcond=None)
+        return p / self.size
+
+    def model(self, p: Array) -> tuple[Array, Array]:
+        """Reflected A and the output x of the model with it."""
+        A, B = self.orders.split(p)
+        A = stabilised(A)
+        x = np.zeros(len(self.y))
+        for b, u in zip(B, self.inputs.T, strict=True):
+            x += lfilter(b, A, u)
+        if self.nuisance:
+            x += lfilter(p[self.orders.count :], A, self.impulse)
+        return A, x
+
+    def residuals(self, p: Array) -> Array:
+        """Measured minus simulated output, (N - first,)."""
+        error: Array = (self.y - self.model(p)[1])[self.first :]
+        return error
+
+    def filtered(self, p: Array, c: Array, d: Array) -> tuple[Array, Array, Array]:
+        """Instruments, regressors and output, filtered by C / (A D)."""
+        A, x = self.model(p)
+        signals = np.column_stack([self.y, x, self.inputs, self.impulse])
+        signals = np.asarray(lfilter(c, np.convolve(A, d), signals, axis=0))
+        y, x, inputs, impulse = np.split(signals, [1, 2, -1], axis=1)
+        Z, Phi = (self.rows(s[:, 0], inputs, impulse[:, 0]) for s in (x, y))
+        return Z, Phi, y[self.first :, 0]
+
+    def refine(self, p: Array, c: Array, d: Array) -> Array:
+        """One pass of refined instrumental variables."""
+        Z, Phi, y = self.filtered(p, c, d)
+        instruments = (Z / _norms(Z)).T
+        return np.linalg.solve(instruments @ (Phi / self.size), instruments @ y) / (
+            self.size
+        )
+
+    def descend(self, p: Array, c: Array, d: Array) -> Array:
+        """One Gauss-Newton step, halved until it lowers the residuals of a stable A.
+
+        Its fixed points are those of ``refine``: the instruments are the slopes of the
+        innovations.
+
+        Raises
+        ------
+        LinAlgError
+            If no part of the step does.
+        """
+        Z, Phi, y = self.filtered(p, c, d)
+        size = _norms(Z)
+        step, *_ = np.linalg.lstsq(Z / size, y - Phi @ p, rcond=None)
+        step = step / size
+        least = self.cost(p, c, d) * (1.0 + 1e-12)
+        for _ in range(HALVINGS):
+            new = p + step
+            if is_stable(self.orders.split(new)[0]) and self.cost(new, c, d) <= least:
+                return new
+            step = step / 2.0
+        raise np.linalg.LinAlgError("no step lowers the residuals")
+
+    def cost(self, p: Array, c: Array, d: Array) -> float:
+        """Sum of squares of the innovations."""
+        e = np.asarray(lfilter(c, d, self.residuals(p)))
+        return float(e @ e)
+
+    def settle(self, p: Array, noise: Noise) -> tuple[Array, int, str]:
+        """Repeat passes until the parameters stand still at a stable model.
+
+        Passes that swing, diverge or end in an unstable model go on from there as
+        guarded steps.
+
+        Returns
+        -------
+        parameters, number of passes, problem
+        """
+        p, passes, problem = self.repeat(p, noise, self.refine, FREE, CONVERGED)
+        A, _ = self.orders.split(p)
+        if not problem and is_stable(A):
+            return p, passes, problem
+        p = np.concatenate([stabilised(A)[1:], p[self.orders.na :]])
+        p, more, problem = self.repeat(
+            p, noise, self.descend, GUARDED, GUARDED_CONVERGED
+        )
+        return p, passes + more, problem
+
+    def repeat(
+        self,
+        p: Array,
+        noise: Noise,
+        one_pass: Callable[[Array, Array, Array], Array],
+        bound: int,
+        converged: float,
+    ) -> tuple[Array, int, str]:
+        """Repeat one kind of pass; see ``settle``."""
+        change = np.inf
+        for passes in range(1, bound + 1):
+            try:
+                new = one_pass(p, *fit_noise(self.residuals(p), noise))
+            except np.linalg.LinAlgError:
+                return p, passes, "the instruments do not determine the parameters"
+            if not np.isfinite(new).all():
+                return p, passes, "the passes diverged"
+            change, p = self.change(new, p), new
+            if change < converged:
+                return p, passes, ""
+        return p, bound, f"the passes did not settle: last change {change:.1e}"
+
+    def change(self, new: Array, old: Array) -> float:
+        """Largest change between passes."""
+        largest = max(float(np.abs(new * self.size).max()), 1e-300)
+        return float(np.abs((new - old) * self.size).max()) / largest
+
+    def finish(
+        self, p: Array, method: str, passes: int, problem: str, c: Array, d: Array
+    ) -> Estimate:
+        """Say what is wrong with the result and how certain it is."""
+        A, _ = self.orders.split(p)
+        if not is_stable(A):
+            problem = "the model is unstable"
+        Z, _, _ = self.filtered(p, c, d)
+        e = np.asarray(lfilter(c, d, self.residuals(p)))
+        return self.estimate(p, Z, e, method, passes, problem, c, d)
+
+    def estimate(
+        self,
+        p: Array,
+        Z: Array,
+        e: Array,
+        method: str,
+        passes: int,
+        problem: str,
+        c: Array,
+        d: Array,
+    ) -> Estimate:
+        """Estimate with both covariances, without the nuisance coefficients."""
+        n = self.orders.count
+        bread = inverse_product(Z)
+        settled = e[max(len(c), len(d)) - 1 :]
+        s2 = np.mean(settled**2) * len(e) / (len(e) - n)
+        return Estimate(
+            orders=self.orders,
+            parameters=p[:n],
+            covariance=s2 * bread[:n, :n],
+            sandwich=(bread @ _weighted(Z, e, self.orders.reach) @ bread)[:n, :n],
+            record=self.record,
+            method=method,
+            passes=passes,
+            problem=problem,
+            noise_c=c,
+            noise_d=d,
+            initial=p[n:],
+            start=self.start,
+        )
+
+
+def _check(record: Record, orders: Orders, start: Start) -> None:
+    if start not in get_args(Start):
+        raise ValueError(f'start = "{start}": expected one of {get_args(Start)}')
+    if record.y.shape[1] != 1:
+        raise ValueError(
+            f"record has {record.y.shape[1]} outputs, expected one at a time: "
+            "see Record.output"
+        )
+    inputs = inputs_of(record)
+    if inputs.shape[1] != len(orders.nb):
+        raise ValueError(
+            f"orders {orders} are for {len(orders.nb)} inputs, the record has "
+            f"{inputs.shape[1]}"
+        )
+    for name, u in zip(input_names(record), inputs.T, strict=True):
+        if np.ptp(u) == 0.0 and (start != "rest" or u[0] == 0.0):
+            raise ValueError(
+                f"input {name} is constant: nothing can be learnt of it, unless it "
+                'stepped from zero at the first sample (start = "rest")'
+            )
+
+
+def _norms(columns: Array) -> Array:
+    size = np.linalg.norm(columns, axis=0)
+    return np.where(size > 0.0, size, 1.0)
+
+
+def inverse_product(Z: Array) -> Array:
+    """Inverse of Z'Z; what Z does not determine gets a huge variance, never none."""
+    size = _norms(Z)
+    values, axes = np.linalg.eigh((Z / size).T @ (Z / size))
+    values = np.maximum(values, np.finfo(float).eps * values.max())
+    return (axes / values) @ axes.T / np.outer(size, size)
+
+
+def _weighted(Z: Array, e: Array, reach: int) -> Array:
+    """Newey and West's middle: instruments weighted by the errors' own correlation.
+
+    Bartlett weights over the usual 4 (N / 100)^(2/9) lags and the equation's reach.
+    """
+    scores = Z * e[:, None]
+    lags = min(int(4 * (len(Z) / 100.0) ** (2.0 / 9.0)) + reach, len(Z) - 1)
+    middle = scores.T @ scores
+    for lag in range(1, lags + 1):
+        product = scores[lag:].T @ scores[:-lag]
+        middle += (1.0 - lag / (lags + 1.0)) * (product + product.T)
+    return middle
