@@ -50,6 +50,7 @@ export function render({ model, el }) {
   const choose = (name, value) => {
     values[name] = value
     if (update[name]) update[name](value)
+    needed()
     send()
     clearTimeout(address)
     address = setTimeout(writeAddress, 250)
@@ -144,7 +145,9 @@ export function render({ model, el }) {
         const kind = { one: "one", several: "several" }[item.kind] ?? "slider"
         const help = element("p", { id: id + "-help", class: "help" })
         help.textContent = item.help
-        part.append(element("div", { class: `choice ${kind}` }, ...make(item, id), help))
+        const choice = element("div", { class: `choice ${kind}` }, ...make(item, id), help)
+        choice.dataset.name = item.name
+        part.append(choice)
       }
       form.append(part)
     }
@@ -158,9 +161,13 @@ export function render({ model, el }) {
   const take = () => {
     values = { ...model.state.values }
     for (const [name, show] of Object.entries(update)) show(values[name])
-    for (const key of ["u", "du", "y"]) {
-      const own = form.querySelector(`[name="${key}_max"]`)
-      own?.closest(".choice").classList.toggle("idle", values[`limit_${key}`] !== "own")
+    needed()
+  }
+
+  const needed = () => {
+    for (const { name, when } of model.form.groups.flatMap((group) => group.items)) {
+      const idle = when && values[when[0]] !== when[1]
+      form.querySelector(`[data-name="${name}"]`).classList.toggle("idle", Boolean(idle))
     }
   }
 

@@ -1,12 +1,14 @@
 """Entry point of the live pages: which there are, and the index of them."""
 
+import html
 from collections.abc import Callable
 
 import panel as pn
 from panel.viewable import Viewable
 
 from apps.pages import governor, receding_horizon
-from apps.pages.live import page_template, text_style
+from apps.pages.live import Subject, page_template, text_style
+from apps.session import known_case
 
 THREADS = 4
 
@@ -22,15 +24,31 @@ disturbances, and a plant that differs from its model.</a>
 One loop with and without a governor that bends the reference just enough to keep
 every limit.</a>
 </div>
+<h2>Start from an example</h2>
 """
 
 
 def index() -> pn.Template:
     """Build the page that leads to the others."""
     page = page_template("", "Predictive control in the non-minimal state space")
-    text = pn.pane.HTML(INDEX, stylesheets=[text_style()], sizing_mode="stretch_width")
+    subjects = (receding_horizon.SUBJECT, governor.SUBJECT)
+    lists = "".join(_examples(subject) for subject in subjects)
+    text = pn.pane.HTML(
+        INDEX + lists, stylesheets=[text_style()], sizing_mode="stretch_width"
+    )
     page.add_panel("index", text)
     return page
+
+
+def _examples(subject: Subject) -> str:
+    """List the cases of a page, each with what to look at."""
+    entries = "".join(
+        f'<dt><a href="{subject.path}?case={name}">{html.escape(title)}</a></dt>'
+        f"<dd>{html.escape(subject.look[name])}</dd>"
+        for name in subject.choices.cases()
+        for title in [known_case(name).title]
+    )
+    return f"<h3>{html.escape(subject.heading)}</h3><dl>{entries}</dl>"
 
 
 def pages() -> dict[str, Callable[[], Viewable]]:

@@ -160,9 +160,10 @@ export function render({ model, el }) {
     const data = run.data, t0 = data[k] + curve.ahead * dt
     const from = curve.start + k * curve.steps
     context.beginPath()
+    if (curve.present !== null) context.moveTo(X(data[k]), Y(data[curve.present + k]))
     for (let i = 0; i < curve.steps; i++) {
       const x = X(t0 + i * dt), y = Y(data[from + i])
-      if (i === 0) context.moveTo(x, y)
+      if (i === 0 && curve.present === null) context.moveTo(x, y)
       else context.lineTo(x, y)
       if (curve.held) context.lineTo(X(t0 + (i + 1) * dt), y)
     }
@@ -279,13 +280,18 @@ export function render({ model, el }) {
 
   const theme = () => {
     colors = colorsNow()
+    const large = window.innerWidth >= 1900  // a projector, or a wall
     for (const view of Object.values(views)) {
       const plot = view.model
-      quietly(plot.title, { text_color: colors.ink })
+      const size = large ? "15px" : "12px"
+      quietly(plot.title, {
+        text_color: colors.ink, text_font_size: large ? "17px" : "13px",
+      })
       for (const axis of [...plot.below, ...plot.left]) {
         if (!axis.type.endsWith("Axis")) continue
         quietly(axis, {
           axis_label_text_color: colors.ink, major_label_text_color: colors.ink,
+          axis_label_text_font_size: size, major_label_text_font_size: size,
           axis_line_color: colors.quiet, major_tick_line_color: colors.quiet,
         })
       }

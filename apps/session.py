@@ -145,6 +145,9 @@ class Choices(param.Parameterized):
     )
 
     scale: ClassVar[dict[str, str]] = {"u_max": "log", "du_max": "log", "y_max": "log"}
+    when: ClassVar[dict[str, tuple[str, str]]] = {
+        f"{key}_max": (f"limit_{key}", "own") for key in ("u", "du", "y")
+    }
     groups: ClassVar[dict[str, tuple[str, ...]]] = {}
     default_case: ClassVar[str] = ""
 
@@ -258,6 +261,7 @@ class Choices(param.Parameterized):
     def _item(self, key: str) -> dict[str, Any]:
         parameter = self.param[key]
         item = {"name": key, "label": parameter.label, "help": parameter.doc}
+        item["when"] = self.when.get(key)
         if isinstance(parameter, param.ListSelector):
             options = [[name, plain(name)] for name in parameter.objects]
             return {**item, "kind": "several", "options": options, "most": MOST_RUNS}
@@ -589,6 +593,11 @@ class GovernorChoices(Choices):
         doc="Larger steps of r bring the loop closer to its limits.",
     )
 
+    when: ClassVar[dict[str, tuple[str, str]]] = {
+        **Choices.when,
+        "free_until": ("reading", "zero after step s"),
+        "decay": ("reading", "decaying"),
+    }
     groups: ClassVar[dict[str, tuple[str, ...]]] = {
         "Case": ("case", "reference", "output", "input"),
         "Governor": ("Np", "reading", "free_until", "decay", "timing"),

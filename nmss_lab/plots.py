@@ -72,6 +72,8 @@ class Curve:
         Prediction made at each sample.
     ahead : int
         Samples from the present one to the first predicted one.
+    present : array (N,), optional
+        Values at the samples, from which a trail that starts later sets out.
     """
 
     label: str
@@ -81,6 +83,7 @@ class Curve:
     style: int = 0
     trail: Array | None = None
     ahead: int = 0
+    present: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,7 +188,9 @@ def loop_charts(
     cost = _curves(runs, lambda run: run.cost)
     active = _curves(runs, lambda run: run.active.sum(axis=1).astype(float))
     charts.append(Chart("cost", "Cost of the plan", "J [-]", cost))
-    charts.append(Chart("active", "Active limits in the plan", "number [-]", active))
+    charts.append(
+        Chart("active", "Active limits in the plan", "number [-]", active, counts=True)
+    )
     return [_timed(chart, first) for chart in charts]
 
 
@@ -214,7 +219,7 @@ def governor_charts(
     planned_beta = governed.trail("beta")[:, :, output]
     reference = Chart(
         "reference",
-        "Reference r and governed reference w",
+        "Reference r and governed w",
         f"r, w{unit}",
         (Curve(f"w, {name}", t, w, True, 0, planned_w, ahead),),
         (Curve("reference r", t, r, held=True),),
@@ -235,7 +240,8 @@ def _outputs(runs: Mapping[str, Run], channel: int) -> tuple[Curve, ...]:
         every = max(1, len(run.t_fine) // DRAWN_POINTS)
         t, values = run.t_fine[::every], run.y_fine[::every, channel]
         trail = _trail(run, "y", channel)
-        curves.append(Curve(name, t, values, False, style, trail, 1))
+        present = run.y[:, channel]
+        curves.append(Curve(name, t, values, False, style, trail, 1, present))
     return tuple(curves)
 
 
@@ -274,14 +280,17 @@ def _sides(run: Run, signal: Any, channel: int) -> tuple[float, float]:
     return float(low[channel]), float(high[channel])
 
 
+def time_unit(run: Run) -> tuple[float, str]:
+    """Choose a unit of time for the length of a run: its seconds, and its name."""
+    seconds = float(run.t[-1])
+    units = ((86400.0, "d"), (3600.0, "h"), (60.0, "min"))
+    fitting = [unit for unit in units if seconds >= 8.0 * unit[0]]
+    return fitting[0] if fitting else (1.0, "s")
+
+
 def _timed(chart: Chart, run: Run) -> Chart:
     """Chart with times in the unit that suits the length of the run."""
-    seconds = float(run.t[-1])
-    size, unit = next(
-        (size, unit)
-        for size, unit in ((86400.0, "d"), (3600.0, "h"), (60.0, "min"), (1.0, "s"))
-        if seconds >= 8.0 * size or unit == "s"
-    )
+    size, unit = time_unit(run)
 
     def timed(curves: tuple[Curve, ...]) -> tuple[Curve, ...]:
         return tuple(dataclasses.replace(c, t=c.t / size) for c in curves)
@@ -332,11 +341,12 @@ def _rounded(low: float, high: float) -> tuple[float, float]:
 
 
 def busiest_sample(runs: Mapping[str, Run]) -> int:
-    """Sample at which most limits are active; else where the output errs most."""
+    """Find a sample with most limits active; without any, with the largest error."""
     first = next(iter(runs.values()))
     held = sum(run.active.sum(axis=1) for run in runs.values())
     if np.max(held):
-        return int(np.argmax(held))
+        most = np.flatnonzero(held == np.max(held))
+        return int(most[len(most) // 2])
     return int(np.argmax(np.abs(first.r - first.y).max(axis=1)))
 
 
@@ -358,7 +368,8 @@ def pack(charts: Sequence[Chart]) -> dict[str, Any]:
 
         A line has a "name" (that of its renderer in ``ChartFigure``), and "start" and
         "size" of its times; its values follow them.  A trail has "style", "held",
-        "ahead", "steps" (Np) and "start", where its (N, Np) values begin.
+        "ahead", "steps" (Np), "start", where its (N, Np) values begin, and "present",
+        where the N values begin from which it sets out, or None.
     """
     box = _Box()
     t = charts[0].samples
@@ -416,6 +427,7 @@ def _trails(box: _Box, chart: Chart) -> list[dict[str, Any]]:
             "ahead": curve.ahead,
             "steps": curve.trail.shape[1],
             "start": box.put(curve.trail),
+            "present": None if curve.present is None else box.put(curve.present),
         }
         for curve in chart.curves
         if curve.trail is not None

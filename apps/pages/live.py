@@ -5,7 +5,7 @@ from __future__ import annotations
 import html
 import logging
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -18,7 +18,7 @@ from bokeh.models import Range1d
 from apps.player import Controls, Player, moving
 from apps.session import Choices, plain
 from nmss_lab.measures import table
-from nmss_lab.plots import Chart, ChartFigure, busiest_sample
+from nmss_lab.plots import Chart, ChartFigure, busiest_sample, time_unit
 from nmss_lab.simulate import Run
 
 LOG = logging.getLogger(__name__)
@@ -32,15 +32,16 @@ FAULT = "These choices met a fault in the program; it has been logged."
 KEPT = "The picture still shows the last choices that worked."
 
 COLUMNS = {
-    "rise": "Rise [s]",
-    "settling": "Settling [s]",
+    "rise": "Rise [{time}]",
+    "settling": "Settling [{time}]",
     "overshoot": "Overshoot [%]",
     "IAE": "IAE",
     "ISE": "ISE",
     "coupling": "Coupling",
     "RMS du": "RMS of du",
-    "violations": "Samples outside limits",
+    "violations": "Limits broken",
 }
+IN_TIME = "rise", "settling"
 
 
 @dataclass(frozen=True)
@@ -240,17 +241,19 @@ def _complaint(text: str) -> str:
 
 def _measures(runs: Mapping[str, Run], channel: int) -> str:
     """Table of measures, one row a run."""
-    rows = table(runs, channel)
-    head = "".join(f"<th>{html.escape(text)}</th>" for text in COLUMNS.values())
+    first = next(iter(runs.values()))
+    seconds, unit = time_unit(first)
+    columns = {k: v.format(time=unit) for k, v in COLUMNS.items()}
+    if first.y.shape[1] == 1:
+        del columns["coupling"]
+    head = "".join(f"<th>{html.escape(text)}</th>" for text in columns.values())
     body = "".join(
-        f'<tr><th scope="row"><span class="swatch style{number}"></span>'
-        f"{html.escape(str(row['run']))}</th>"
-        + "".join(f"<td>{_number(row[key])}</td>" for key in COLUMNS)
-        + "</tr>"
-        for number, row in enumerate(rows)
+        _measures_row(row, number, columns, seconds)
+        for number, row in enumerate(table(runs, channel))
     )
     caption = (
-        "First step of the reference for rise, settling and overshoot; whole run else"
+        "Rise, settling and overshoot of the first step of r; limits broken: samples "
+        "outside them; the rest over the whole run"
     )
     return (
         f"<table><caption>{caption}</caption><thead><tr><th>Run</th>{head}</tr></thead>"
@@ -258,5 +261,20 @@ def _measures(runs: Mapping[str, Run], channel: int) -> str:
     )
 
 
-def _number(value: Any) -> str:
-    return "\u2013" if math.isnan(value) else f"{value:.4g}".replace("-", "\u2212")
+def _measures_row(
+    row: Mapping[str, Any], number: int, columns: Iterable[str], seconds: float
+) -> str:
+    name = html.escape(str(row["run"]))
+    cells = "".join(
+        f"<td>{_number(row[key] / (seconds if key in IN_TIME else 1.0))}</td>"
+        for key in columns
+    )
+    swatch = f'<span class="swatch style{number}"></span>'
+    return f'<tr><th scope="row">{swatch}{name}</th>{cells}</tr>'
+
+
+def _number(value: float) -> str:
+    if math.isnan(value):
+        return "\u2013"
+    text = f"{value:.0f}" if 1e4 <= abs(value) < 1e7 else f"{value:.4g}"
+    return text.replace("-", "\u2212")
