@@ -68,7 +68,7 @@ def test_ten_and_thirty_steps_are_the_same():
 
 
 def test_governed_reference_is_reference_plus_perturbation():
-    """w = r + beta (3.6), in the run and in the trail."""
+    """Equation (3.6), w = r + beta, in the run and in the trail."""
     found = run()
     beta, w = found.trail("beta"), found.trail("w")
     assert found.w == pytest.approx(found.r + beta[:, 0], abs=REPLAY)
@@ -88,7 +88,7 @@ def test_perturbation_is_the_smallest_that_keeps_the_limits():
 
 
 def test_input_follows_the_gain_on_the_governed_reference():
-    """u = -K x with w in the sum of the error, whatever the limits do."""
+    """The law u = -K x with w in the sum of the error, whatever the limits do."""
     found = run()
     z, ys, us = 0.0, [0.0, 0.0], [0.0]
     for k in range(len(found)):

@@ -72,7 +72,7 @@ def test_poles_of_the_marginally_stable_plant():
 
 @pytest.mark.parametrize("sizes", SIZES, ids=str)
 def test_poles_are_where_the_denominator_loses_rank(rng, sizes):
-    """det A(z) = 0, and as many as na n_y."""
+    """Where det A(z) = 0, and as many as na n_y."""
     model = random_model(rng, *sizes)
     poles = model.poles()
     assert poles.size == model.na * model.n_y

@@ -54,7 +54,7 @@ def test_weights_may_differ_at_every_step():
 
 
 def test_only_the_symmetric_part_of_a_weight_counts(rng):
-    """x'Qx does not see the rest."""
+    """The form x'Qx does not see the rest."""
     model = random_model(rng, 2, 2)
     Q = positive(rng, 2)
     skew = np.array([[0.0, 1.0], [-1.0, 0.0]])

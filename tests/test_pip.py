@@ -143,7 +143,7 @@ def test_incremental_law_is_3_13_corrected():
 
 
 def test_positional_law_is_3_4():
-    """u = -K x over the state of (3.2) when nothing saturates."""
+    """The law u = -K x over the state of (3.2) when nothing saturates."""
     found = run("positional")
     z, y, u = 0.0, [0.0, 0.0], 0.0
     for k in range(len(found)):

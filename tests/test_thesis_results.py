@@ -18,7 +18,7 @@ from nmss_lab.analysis import linear_loop
 from nmss_lab.design import Design
 from nmss_lab.measures import steps
 from nmss_lab.predict import Horizon
-from nmss_lab.reproduce import chapter_5, chapter_6
+from nmss_lab.reproduce import chapter_5, poles
 from nmss_lab.simulate import Run, Scenario, closed_loop, closed_loops
 
 GOLDEN = Path(__file__).parent / "golden"
@@ -253,10 +253,12 @@ def test_feedback_and_forward_path(key: str) -> None:
     controller = design.build()
     assert controller.gain("x")[0] == pytest.approx(found["K"], abs=SAME)
     model = design.model
-    pair = chapter_6._PolePair(controller)
+    pair = poles.PolePair(controller)
     for forward, form in ((False, "fb"), (True, "fp")):
-        poles = pair.poles(model.a[:, 0].T, model.b[:, 0].T, forward)[0]
-        assert np.poly(poles).real == pytest.approx(found[f"poly_{form}"], abs=SAME)
+        found_poles = pair.poles(model.a[:, 0].T, model.b[:, 0].T, forward)[0]
+        assert np.poly(found_poles).real == pytest.approx(
+            found[f"poly_{form}"], abs=SAME
+        )
         structure = "forward_path" if forward else "wang_young"
         other = dataclasses.replace(design, structure=structure).build()
         run = closed_loop(model.plant(), other, Scenario(np.ones(8)))
@@ -292,7 +294,7 @@ def test_table_6_1(
     """Bounds of the uncertainty to 1e-6."""
     found = chapters_6_7["table61"][form][f"{factor}_{end}"]["bound"]
     side = -1 if end == "min" else 1
-    ours = chapter_6._bound(form == "fp", factor == "eps1", side)
+    ours = poles.bound(form == "fp", factor == "eps1", side)
     assert ours == pytest.approx(found, abs=SAME)
 
 
@@ -519,8 +521,8 @@ def test_monte_carlo_shares() -> None:
     Two independent shares of 2000 draws differ by less than 3 standard errors.
     """
     for form, share in (("feedback", 0.237), ("forward", 0.513)):
-        ours = chapter_6._cloud("covariance", form).unstable
-        error = np.sqrt(2.0 * share * (1.0 - share) / chapter_6.DRAWS)
+        ours = poles.cloud("covariance", form).unstable
+        error = np.sqrt(2.0 * share * (1.0 - share) / poles.DRAWS)
         assert abs(ours - share) < 3.0 * error
 
 
