@@ -255,10 +255,8 @@ def test_feedback_and_forward_path(key: str) -> None:
     model = design.model
     pair = poles.PolePair(controller)
     for forward, form in ((False, "fb"), (True, "fp")):
-        found_poles = pair.poles(model.a[:, 0].T, model.b[:, 0].T, forward)[0]
-        assert np.poly(found_poles).real == pytest.approx(
-            found[f"poly_{form}"], abs=SAME
-        )
+        placed = pair.poles(model.a[:, 0].T, model.b[:, 0].T, forward)[0]
+        assert np.poly(placed).real == pytest.approx(found[f"poly_{form}"], abs=SAME)
         structure = "forward_path" if forward else "wang_young"
         other = dataclasses.replace(design, structure=structure).build()
         run = closed_loop(model.plant(), other, Scenario(np.ones(8)))
