@@ -15,6 +15,7 @@ from strategies import (
 )
 
 from nmss_lab import qp
+from nmss_lab.cases import CASES, case
 from nmss_lab.controller import Limits, Status
 from nmss_lab.governor import governor
 from nmss_lab.models import DifferenceModel
@@ -29,6 +30,7 @@ from nmss_lab.mpc import (
 )
 from nmss_lab.pip import lq_gain, pip, pole_gain
 from nmss_lab.predict import Horizon, cumulate
+from nmss_lab.predictive import PredictiveController
 from nmss_lab.simulate import Scenario, closed_loop
 
 DISTURBED = [each for each in SIZES if each[2]]
@@ -331,6 +333,37 @@ def test_solvers_agree_on_the_applied_move(backend):
         moves = [c.first_move.value(s.decision, theta) for s in (ours, other)]
         assert moves[0] == pytest.approx(moves[1], abs=DECISION), f"seed {seed}"
     assert constrained > 100
+
+
+def limited_run(example, design):
+    """Run a case's design; with tighter limits where its own are never active."""
+    run = closed_loop(example.plant, design.build(), example.scenario)
+    if not (run.status == Status.LIMITED).any():
+        peak = 0.6 * np.abs(run.u).max(axis=0)
+        design = dataclasses.replace(design, limits=Limits(u=(-peak, peak)))
+        run = closed_loop(example.plant, design.build(), example.scenario)
+    return run
+
+
+@pytest.mark.parametrize("name", sorted(CASES))
+def test_solvers_agree_on_the_worked_examples(name):
+    """On the applied move to 1e-6, wherever a limit is active in the case's run."""
+    example, compared = case(name), 0
+    for title, design in example.designs.items():
+        if not isinstance(design.build(), PredictiveController):
+            continue
+        run = limited_run(example, design)
+        c = run.controller
+        for k in np.flatnonzero(run.status == Status.LIMITED)[:12]:
+            theta, applied = run.moves.known[k], run.u[k]
+            for backend in ("daqp", "proxqp", "qpsolvers/quadprog"):
+                s = qp.solve(c.program, theta, backend)
+                u = c.first_move.value(s.decision, theta)
+                message = f"{name}, {title}, k = {k}, {backend}: {u} against {applied}"
+                assert s.found, message
+                assert np.abs(u - applied).max() <= DECISION, message
+                compared += 1
+    assert compared > 0
 
 
 def test_every_accepted_solution_meets_the_optimality_conditions():
