@@ -8,18 +8,27 @@ what a closed-loop run can be exported to.  Nothing here knows about models.
 from __future__ import annotations
 
 import csv
-import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from os import PathLike
-from typing import Any, Literal, TextIO, TypeAlias
+from pathlib import Path
+from typing import Any, Literal, NotRequired, TypeAlias, TypedDict, Unpack
 
 import numpy as np
 
-Array = np.ndarray[Any, np.dtype[np.float64]]
-File: TypeAlias = str | PathLike[str] | TextIO
+from nmss_lab.tables import (
+    Array,
+    Bad,
+    File,
+    Table,
+    opened,
+    read_csv,
+    read_file,
+    read_frame,
+)
+
 Trend: TypeAlias = Literal["constant", "linear", "first"]
+Method: TypeAlias = Literal["linear", "previous"]
 
 GROUPS = ("y", "u", "v", "r")
 
@@ -31,6 +40,55 @@ ROUNDING = 1e-6
 
 def _empty() -> Array:
     return np.empty((0, 0))
+
+
+class Columns(TypedDict):
+    """What to read under which names; see `Record.from_csv`."""
+
+    y: Sequence[str]
+    u: NotRequired[Sequence[str]]
+    v: NotRequired[Sequence[str]]
+    r: NotRequired[Sequence[str]]
+    time: NotRequired[str | None]
+    dt: NotRequired[float | None]
+    bad: NotRequired[Bad]
+
+
+@dataclass(frozen=True)
+class Gap:
+    """An interval between two samples that is not the usual one.
+
+    Parameters
+    ----------
+    row : int
+        Sample before it, counted from 0.
+    start, stop : float
+        Times of the two samples.
+    usual : float
+        Usual interval.
+    """
+
+    row: int
+    start: float
+    stop: float
+    usual: float
+
+    @property
+    def length(self) -> float:
+        """Time between the two samples."""
+        return self.stop - self.start
+
+    @property
+    def missing(self) -> int:
+        """Samples that are missing in between."""
+        return max(round(self.length / self.usual) - 1, 0)
+
+    def __str__(self) -> str:
+        """Say where it is and how long."""
+        return (
+            f"{self.length:g} instead of {self.usual:g} after row {self.row} "
+            f"(time {self.start:g}), {self.missing} samples missing"
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +109,8 @@ class Record:
         Missing groups are called y1, y2, ... and so on.  All names differ.
     units : mapping from column name (or "time") to unit, optional
         Columns without a unit are left out.
+    notes : tuple of str, optional
+        What was done to the record on the way: rows left out, gaps bridged.
 
     Raises
     ------
@@ -72,6 +132,7 @@ class Record:
     r: Array = field(default_factory=_empty)
     names: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     units: Mapping[str, str] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         time = _frozen(self.time)
@@ -239,18 +300,81 @@ class Record:
         parts = {name: getattr(self, name)[start:stop] for name in ("time", *GROUPS)}
         return replace(self, **parts)
 
+    def output(self, name: str) -> Record:
+        """Keep one output and all inputs and disturbances, to fit a model of it.
+
+        Raises
+        ------
+        ValueError
+            If no output has that name.
+        """
+        if name not in self.names["y"]:
+            raise ValueError(f"no output {name!r}; there are {self.names['y']}")
+        at = self.names["y"].index(name)
+        kept = {name, "time", *self.names["u"], *self.names["v"]}
+        names = {"y": (name,), "u": self.names["u"], "v": self.names["v"]}
+        units = {k: unit for k, unit in self.units.items() if k in kept}
+        return replace(
+            self, y=self.y[:, at], r=np.empty((0, 0)), names=names, units=units
+        )
+
+    def gaps(self) -> tuple[Gap, ...]:
+        """Where the sampling departs from its usual interval; empty if it is regular.
+
+        The usual interval is the median.
+        """
+        steps = np.diff(self.time)
+        usual = float(np.median(steps)) if steps.size else 0.0
+        odd = np.flatnonzero(np.abs(steps - usual) > IRREGULAR * usual)
+        return tuple(
+            Gap(int(i), float(self.time[i]), float(self.time[i + 1]), usual)
+            for i in odd
+        )
+
+    def resample(self, dt: float, method: Method = "linear") -> Record:
+        """Read all signals at regular times from the first to the last sample.
+
+        Nothing is smoothed: take out what is faster than half the new rate before.
+
+        Parameters
+        ----------
+        dt : float
+            New interval, in the unit of time.
+        method : {"linear", "previous"}
+            Outputs and disturbances between two samples: on a line, or held.  Inputs
+            and references are held, as an actuator holds them.
+
+        Returns
+        -------
+        Record
+            Says in ``notes`` what was bridged.
+
+        Raises
+        ------
+        ValueError
+            If dt is not positive or longer than the record.
+        """
+        span = float(self.time[-1] - self.time[0])
+        if not 0 < dt <= span:
+            raise ValueError(f"dt = {dt}: expected more than 0 and at most {span:g}")
+        if method not in ("linear", "previous"):
+            raise ValueError(f'method = {method!r}: expected "linear" or "previous"')
+        time = self.time[0] + dt * np.arange(int(span / dt * (1 + ROUNDING)) + 1)
+        held = np.searchsorted(self.time, time + ROUNDING * dt, side="right") - 1
+        parts = {group: getattr(self, group)[held] for group in GROUPS}
+        if method == "linear":
+            for group in ("y", "v"):
+                columns = getattr(self, group).T
+                lines = [np.interp(time, self.time, column) for column in columns]
+                parts[group] = np.array(lines).T
+        gaps = self.gaps()
+        longest = max((gap.length for gap in gaps), default=0.0)
+        bridged = f", {len(gaps)} odd intervals, longest {longest:g}" if gaps else ""
+        note = f"resampled every {dt:g} ({method}{bridged})"
+        return replace(self, time=time, notes=(*self.notes, note), **parts)
+
     @classmethod
-    def from_csv(
-        cls,
-        file: File,
-        *,
-        y: Sequence[str],
-        u: Sequence[str] = (),
-        v: Sequence[str] = (),
-        r: Sequence[str] = (),
-        time: str | None = None,
-        dt: float | None = None,
-    ) -> Record:
+    def from_csv(cls, file: File, **columns: Unpack[Columns]) -> Record:
         """Read columns by name from a comma-separated file with one header row.
 
         A unit in square brackets after a name, "T1 [degC]", is read as the unit of
@@ -263,9 +387,13 @@ class Record:
         y, u, v, r : sequences of column names
             Which columns are outputs, inputs, measured disturbances and references.
         time : str, optional
-            Name of the column of time stamps.
+            Name of the column of time stamps: numbers, or ISO dates with their zone
+            (without one they count as UTC), which become seconds since the first.
         dt : float, optional
             Sampling interval if the file has no time column.  Give one of the two.
+        bad : {"refuse", "skip"}
+            What to do with rows that lack a finite number or go back in time.  What
+            was skipped stands in ``notes``; the gap it leaves is for ``resample``.
 
         Returns
         -------
@@ -275,26 +403,70 @@ class Record:
         Raises
         ------
         ValueError
-            If a column is missing or named twice, or if a cell is not a finite number:
-            the message gives the row of the file (the header is row 1) and the column.
+            If a column is missing or named twice, or for bad rows: the message gives
+            the rows of the file (the header is row 1) and the column.
         """
-        _check_choice(y, time, dt)
-        groups = {"y": y, "u": u, "v": v, "r": r}
+        return cls._of(
+            lambda wanted, time, bad: read_csv(file, wanted, time, bad), columns
+        )
+
+    @classmethod
+    def from_frame(cls, frame: Any, **columns: Unpack[Columns]) -> Record:
+        """Read columns by name from a pandas DataFrame.
+
+        Arguments and errors are those of ``from_csv``; rows are counted from 0, and
+        the index may serve as the time column if it has a name.
+        """
+        return cls._of(
+            lambda wanted, time, bad: read_frame(frame, wanted, time, bad), columns
+        )
+
+    @classmethod
+    def from_file(cls, path: str | PathLike[str], **columns: Unpack[Columns]) -> Record:
+        """Read columns by name from a .csv, .mat, .xlsx or .parquet file.
+
+        Arguments and errors are those of ``from_csv``.  In a .mat file a column is a
+        vector, or one of M1, M2, ... of a matrix M.  Spreadsheets and Parquet need
+        ``nmss-lab[excel]`` and ``nmss-lab[parquet]``.
+        """
+        return cls._of(
+            lambda wanted, time, bad: read_file(Path(path), wanted, time, bad), columns
+        )
+
+    @classmethod
+    def _of(
+        cls,
+        read: Callable[[Sequence[str], str | None, Bad], Table],
+        columns: Columns,
+    ) -> Record:
+        """Make a record of what a reader finds under the names."""
+        time, dt = columns.get("time"), columns.get("dt")
+        groups: dict[str, Sequence[str]] = {
+            "y": columns["y"],
+            "u": columns.get("u", ()),
+            "v": columns.get("v", ()),
+            "r": columns.get("r", ()),
+        }
+        _check_choice(groups["y"], time, dt)
         wanted = [name for group in groups.values() for name in group]
         wanted += [time] if time is not None else []
-        with _opened(file, "r") as stream:
-            table, units = _read_columns(stream, wanted)
+        table = read(wanted, time, columns.get("bad", "refuse"))
+        units = dict(table.units)
         if time is not None and time in units:
             units["time"] = units.pop(time)
-        size = next(iter(table.values())).size
-        stamps = np.arange(float(size))
-        stamps = stamps * dt if dt is not None else table[str(time)]
+        size = len(table.columns[wanted[0]])
+        stamps = table.columns[time] if time is not None else np.arange(float(size))
         signals = {
-            group: np.array([table[name] for name in names]).T
+            group: np.array([table.columns[name] for name in names]).T
             for group, names in groups.items()
         }
-        names = {group: tuple(columns) for group, columns in groups.items()}
-        return cls(time=stamps, names=names, units=units, **signals)
+        return cls(
+            time=stamps * dt if dt is not None else stamps,
+            names={group: tuple(names) for group, names in groups.items()},
+            units=units,
+            notes=table.notes,
+            **signals,
+        )
 
     def to_csv(self, file: File) -> None:
         """Write time and all columns, units in the header, numbers without loss."""
@@ -302,10 +474,47 @@ class Record:
             f"{name} [{self.units[name]}]" if name in self.units else name
             for name in ("time", *self.columns)
         ]
-        with _opened(file, "w") as stream:
+        with opened(file, "w") as stream:
             writer = csv.writer(stream, lineterminator="\n")
             writer.writerow(header)
             writer.writerows(np.column_stack([self.time, self.values]).tolist())
+
+
+def shipped(name: str) -> Record:
+    """Read a record that comes with the package; ``nmss_lab/data`` says whence.
+
+    Parameters
+    ----------
+    name : {"gas_furnace", "tclab_step_test"}
+
+    Raises
+    ------
+    ValueError
+        If there is no such record.
+
+    Examples
+    --------
+    >>> shipped("gas_furnace").names["u"]
+    ('u_gas_rate',)
+    """
+    if name not in SHIPPED:
+        raise ValueError(f"name = {name!r}: expected one of {tuple(SHIPPED)}")
+    columns, units = SHIPPED[name]
+    record = Record.from_csv(Path(__file__).parent / "data" / f"{name}.csv", **columns)
+    return replace(record, units={"time": "s", **units})
+
+
+SHIPPED: dict[str, tuple[Columns, dict[str, str]]] = {
+    "gas_furnace": (
+        {"y": ["y_co2_percent"], "u": ["u_gas_rate"], "dt": 9.0},
+        {"y_co2_percent": "%"},
+    ),
+    "tclab_step_test": (
+        {"y": ["T1_C", "T2_C"], "u": ["Q1_percent"], "time": "time_s"},
+        {"T1_C": "degC", "T2_C": "degC", "Q1_percent": "%"},
+    ),
+}
+"""Columns and units of the records that come with the package."""
 
 
 def _numbered(letter: str, count: int) -> tuple[str, ...]:
@@ -362,56 +571,3 @@ def _check_choice(y: Sequence[str], time: str | None, dt: float | None) -> None:
         raise ValueError(f"y is {y!r}; expected a list of column names")
     if dt is not None and not (np.isfinite(dt) and dt > 0):
         raise ValueError(f"dt is {dt}; expected a positive number")
-
-
-@contextmanager
-def _opened(file: File, mode: Literal["r", "w"]) -> Iterator[TextIO]:
-    """Open a path, or hand through a file that the caller opened and will close."""
-    if not isinstance(file, str | PathLike):
-        yield file
-        return
-    encoding = "utf-8-sig" if mode == "r" else "utf-8"
-    with open(file, mode, encoding=encoding, newline="") as stream:
-        yield stream
-
-
-def _read_columns(
-    stream: TextIO, wanted: Sequence[str]
-) -> tuple[dict[str, Array], dict[str, str]]:
-    """Read the wanted columns and their units."""
-    rows = csv.reader(stream)
-    heads = [_name_and_unit(cell) for cell in next(rows, [])]
-    names = [name for name, _ in heads]
-    for name in wanted:
-        if names.count(name) != 1:
-            found = "missing" if name not in names else "there more than once"
-            raise ValueError(f"column {name!r} is {found}; the file has {names}")
-    places = {name: names.index(name) for name in wanted}
-    lines = [
-        [_number(row, place, rows.line_num, name) for name, place in places.items()]
-        for row in rows
-        if row
-    ]
-    if not lines:
-        raise ValueError("the file has no data below its header")
-    units = {name: unit for name, unit in heads if unit and name in places}
-    return dict(zip(places, np.array(lines).T, strict=True)), units
-
-
-def _name_and_unit(cell: str) -> tuple[str, str]:
-    match = re.fullmatch(r"\s*(.*?)\s*\[(.*)\]\s*", cell)
-    return (match[1], match[2].strip()) if match else (cell.strip(), "")
-
-
-def _number(row: Sequence[str], place: int, line: int, name: str) -> float:
-    """Convert one cell; errors count rows as a reader of the file does."""
-    cell = row[place].strip() if place < len(row) else ""
-    try:
-        value = float(cell)
-    except ValueError:
-        value = np.nan
-    if not np.isfinite(value):
-        raise ValueError(
-            f"row {line}, column {name!r}: {cell!r} is not a finite number"
-        )
-    return value

@@ -12,6 +12,7 @@ import nmss_lab
 PACKAGE = Path(nmss_lab.__file__).parent
 
 ORDER = [
+    "tables",
     "records",
     "models",
     "continuous",
@@ -110,13 +111,15 @@ def test_imports_only_earlier_modules(module: str) -> None:
 
 @pytest.mark.parametrize("module", MODULES)
 def test_only_plots_draws(module: str) -> None:
-    """No module but plots imports a drawing library; only cli may serve, lazily."""
+    """Only plots imports a drawing library, cli serves and tables reads, lazily."""
     everywhere = packages(imported(parse(module)))
     at_start = packages(imported_at_start(parse(module)))
     assert "bokeh" not in everywhere or module == "plots"
     assert "panel" not in at_start
     assert "panel" not in everywhere or module == "cli"
-    assert everywhere.isdisjoint({"matplotlib", "plotly", "pandas", "apps", "control"})
+    assert "pandas" not in at_start
+    assert "pandas" not in everywhere or module == "tables"
+    assert everywhere.isdisjoint({"matplotlib", "plotly", "apps", "control"})
 
 
 def test_all_is_what_is_public() -> None:

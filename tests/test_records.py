@@ -4,9 +4,12 @@ import io
 import pickle
 
 import numpy as np
+import pandas
 import pytest
+import scipy.io
+from conftest import ROOT
 
-from nmss_lab.records import Record
+from nmss_lab.records import SHIPPED, Record, shipped
 
 CSV = """time [s],T1 [degC], Q1 [%],ambient,note
 0.0,20.0,0,21.0,start
@@ -188,3 +191,169 @@ def test_empty_parts_are_refused():
         record.split(1.0)
     with pytest.raises(ValueError, match="either fraction or time"):
         record.split()
+
+
+DATES = """when,y [degC],u
+2026-03-29T01:30:00+01:00,1,0
+2026-03-29T03:30:00+02:00,2,1
+2026-03-29T02:30:00Z,3,1
+"""
+
+
+def test_dates_with_a_zone_become_seconds():
+    """An hour is an hour, across summer time and between zones."""
+    record = Record.from_csv(io.StringIO(DATES), y=["y"], u=["u"], time="when")
+    assert record.time.tolist() == [0.0, 3600.0, 7200.0]
+    assert record.units == {"y": "degC"}
+    plain = DATES.replace("+01:00", "").replace("+02:00", "").replace("Z", "")
+    with pytest.raises(ValueError, match=r"row 4.*does not come after the row before"):
+        Record.from_csv(io.StringIO(plain), y=["y"], time="when")
+
+
+@pytest.mark.parametrize(
+    ("cells", "message"),
+    [
+        ("0 1 1", "row 4, column 't': '1' does not come after"),
+        ("0 soon 2", "row 3, column 't': 'soon' is neither a finite number nor an ISO"),
+        ("0 2026-01-01 2", "row 3, column 't': '2026-01-01' is a date among numbers"),
+        ("2026-01-01 5 2026-01-02", "row 3, column 't': '5' is a number among dates"),
+    ],
+)
+def test_bad_times_are_named(cells, message):
+    """Time has to be one kind and to increase."""
+    text = "t,y\n" + "".join(f"{cell},1\n" for cell in cells.split())
+    with pytest.raises(ValueError, match=message):
+        Record.from_csv(io.StringIO(text), y=["y"], time="t")
+
+
+BROKEN = "t,y,u\n0,1,0\n1,oops,0\n2,3,1\n3,4,\n2.5,9,1\n4,5,1\n"
+
+
+def test_bad_rows_are_all_named_and_skipped_on_request():
+    """By default a file with bad rows is refused; skipping leaves a note and a gap."""
+    with pytest.raises(ValueError, match=r"row 3, column 'y': 'oops'.*1 more .*: 5"):
+        Record.from_csv(io.StringIO(BROKEN), y=["y"], u=["u"], time="t")
+    record = Record.from_csv(
+        io.StringIO(BROKEN), y=["y"], u=["u"], time="t", bad="skip"
+    )
+    assert record.time.tolist() == [0.0, 2.0, 2.5, 4.0]
+    assert record.notes[0].startswith("left out: row 3, column 'y': 'oops'")
+    assert record.detrend("first").notes == record.notes
+    with pytest.raises(ValueError, match="no data"):
+        Record.from_csv(io.StringIO("y\nx\n"), y=["y"], dt=1.0, bad="skip")
+    with pytest.raises(ValueError, match='expected "refuse" or "skip"'):
+        Record.from_csv(io.StringIO("y\n1\n"), y=["y"], dt=1.0, bad="ignore")
+
+
+def test_a_frame_reads_like_its_file():
+    """Numbers and dates of pandas, the index as time, missing values by row."""
+    frame = pandas.read_csv(io.StringIO(DATES))
+    frame["when"] = pandas.to_datetime(frame["when"], utc=True)
+    from_file = Record.from_csv(io.StringIO(DATES), y=["y"], u=["u"], time="when")
+    for table in (frame, frame.set_index("when")):
+        record = Record.from_frame(table, y=["y"], u=["u"], time="when")
+        assert np.array_equal(record.time, from_file.time)
+        assert np.array_equal(record.values, from_file.values)
+        assert record.units == from_file.units
+    holed = pandas.DataFrame({"y": [1.0, None, 3.0]})
+    with pytest.raises(ValueError, match="row 1, column 'y': nan is not a finite"):
+        Record.from_frame(holed, y=["y"], dt=1.0)
+
+
+def test_matlab_files(tmp_path):
+    """Vectors by name, columns of a matrix by number; other variables do no harm."""
+    path = tmp_path / "record.mat"
+    y, U = np.arange(5.0), np.arange(10.0).reshape(5, 2)
+    scipy.io.savemat(path, {"y": y, "U": U, "t": 2 * y, "who": "me", "long": y[:3]})
+    record = Record.from_file(path, y=["y"], u=["U2"], v=["U1"], time="t")
+    assert record.y.ravel().tolist() == y.tolist()
+    assert np.array_equal(np.hstack([record.v, record.u]), U)
+    assert record.dt == 2.0
+    with pytest.raises(ValueError, match="column 'z' is missing; the file has"):
+        Record.from_file(path, y=["z"], dt=1.0)
+    with pytest.raises(ValueError, match="differ in length"):
+        Record.from_file(path, y=["y"], u=["long"], dt=1.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "reader", "row"),
+    [("a.xlsx", "read_excel", 3), ("a.parquet", "read_parquet", 1)],
+)
+def test_tables_through_pandas(name, reader, row, tmp_path, monkeypatch):
+    """Spreadsheet rows count from the header; a missing library is named."""
+    frame = pandas.DataFrame({"y [K]": [1.0, 2.0], "u": [3.0, "x"]})
+    monkeypatch.setattr(pandas, reader, lambda path: frame)
+    record = Record.from_file(tmp_path / name, y=["y"], dt=1.0)
+    assert record.units == {"y": "K"}
+    with pytest.raises(ValueError, match=f"row {row}, column 'u': 'x'"):
+        Record.from_file(tmp_path / name, y=["y"], u=["u"], dt=1.0)
+
+    def missing(path):
+        raise ImportError("no such library")
+
+    monkeypatch.setattr(pandas, reader, missing)
+    extra = reader.removeprefix("read_")
+    with pytest.raises(ValueError, match=rf"pip install .nmss-lab\[{extra}\]"):
+        Record.from_file(tmp_path / name, y=["y"], dt=1.0)
+    with pytest.raises(ValueError, match=r"unknown ending '\.txt'"):
+        Record.from_file(tmp_path / "a.txt", y=["y"], dt=1.0)
+
+
+def test_gaps_are_reported_and_bridged_only_on_request():
+    """Where, how long, how many; inputs are held, outputs go along a line."""
+    time = np.delete(np.arange(8.0), [3, 4])
+    record = Record(time=time, y=10 * time, u=time, r=time)
+    (gap,) = record.gaps()
+    assert (gap.row, gap.start, gap.stop, gap.missing) == (2, 2.0, 5.0, 2)
+    assert str(gap) == "3 instead of 1 after row 2 (time 2), 2 samples missing"
+    with pytest.raises(ValueError, match="irregular"):
+        _ = record.dt
+    even = record.resample(1.0)
+    assert even.gaps() == ()
+    assert even.y.ravel().tolist() == [0, 10, 20, 30, 40, 50, 60, 70]
+    assert even.u.ravel().tolist() == [0, 1, 2, 2, 2, 5, 6, 7]
+    assert even.notes == ("resampled every 1 (linear, 1 odd intervals, longest 3)",)
+    held = record.resample(0.5, "previous")
+    assert held.y.ravel()[4:11].tolist() == [20, 20, 20, 20, 20, 20, 50]
+
+
+def test_resampling_at_the_old_times_changes_nothing():
+    """Also where 0.1 is no binary number; nonsense is refused."""
+    record = sample()
+    for method in ("linear", "previous"):
+        same = record.resample(0.1, method)
+        assert np.allclose(same.values, record.values, rtol=0, atol=1e-12)
+    with pytest.raises(ValueError, match="dt = 0"):
+        record.resample(0.0)
+    with pytest.raises(ValueError, match=r"at most 1\.9"):
+        record.resample(2.0)
+    with pytest.raises(ValueError, match="method = 'cubic'"):
+        record.resample(0.1, "cubic")
+
+
+def test_one_output_with_all_inputs():
+    """What a model of one output is fitted to."""
+    record = sample()
+    one = record.output("T")
+    assert np.array_equal(one.y[:, 0], record.y[:, 1])
+    assert one.columns == ("T", "valve", "v1")
+    assert one.units == {"T": "degC", "time": "s"}
+    with pytest.raises(ValueError, match="no output 'valve'"):
+        record.output("valve")
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_shipped_records_say_where_they_come_from(name):
+    """Each has its licence beside it and a line in the table of sources."""
+    record = shipped(name)
+    folder = ROOT / "nmss_lab" / "data"
+    licence = (folder / f"{name}.csv.license").read_text(encoding="utf-8")
+    assert "SPDX-License-Identifier" in licence
+    assert f"`{name}.csv` | {len(record.time)} |" in (folder / "README.md").read_text(
+        encoding="utf-8"
+    )
+    assert record.resample(round(np.median(np.diff(record.time)))).gaps() == ()
+    assert max((gap.missing for gap in record.gaps()), default=0) == 0
+    assert record.units["time"] == "s"
+    with pytest.raises(ValueError, match="expected one of"):
+        shipped("hair_dryer")
