@@ -168,6 +168,18 @@ def test_surrounding_temperature() -> None:
     assert v[558] - v[550] == pytest.approx(-2.0, abs=0.6)  # day and drift go on
 
 
+def test_surroundings_in_which_both_groups_can_be_held() -> None:
+    """About 21.3 to 23.1 degC, as the notes say: elsewhere an input hits its limit."""
+    model = cases.temperature_model()
+    v = np.arange(20.0, 25.0, 0.01)
+    drive = 23.0 - np.outer(model.disturbance_gain()[:, 0], v)
+    u = np.linalg.solve(model.steady_state_gain(), drive)
+    low, high = np.array([[10.0], [15.0]]), np.array([[25.0], [27.0]])
+    held = v[((u >= low) & (u <= high)).all(axis=0)]
+    assert held.min() == pytest.approx(21.3, abs=0.1)
+    assert held.max() == pytest.approx(23.1, abs=0.1)
+
+
 def test_units_of_the_ventilation() -> None:
     """The unit is stated with the model."""
     assert cases.temperature_model().units["ventilation"] == "100 m3/h"

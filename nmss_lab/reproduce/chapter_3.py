@@ -66,7 +66,6 @@ def _form_3_1() -> Iterator[Claim]:
 
 def _pip_gain() -> Iterator[Claim]:
     printed = np.array([3.16, -3.05, 6.10, -0.64])
-    wanted = np.poly([0.0, 0.0, 0.2, 0.2])
     gains = {b1: _gain_for(b1) for b1 in (-1.0, -0.5)}
     yield claim(
         "3.4",
@@ -88,6 +87,11 @@ def _pip_gain() -> Iterator[Claim]:
         PRINTED,
         because="the plant printed in 3.4 is not the one of (6.10); see E3.1",
     )
+
+
+def _pip_poles() -> Iterator[Claim]:
+    printed = np.array([3.16, -3.05, 6.10, -0.64])
+    wanted = np.poly([0.0, 0.0, 0.2, 0.2])
     polynomial, slack = _placed(-1.0, printed)
     yield claim(
         "3.4",
@@ -143,6 +147,11 @@ def _without_governor() -> Iterator[Claim]:
         over,
         note=f"max u {np.abs(free.u).max():.2f}, max du {np.abs(free.du).max():.2f}",
     )
+
+
+def _ungoverned_changes() -> Iterator[Claim]:
+    case = case_of("governor_3_4")
+    pip = case.designs["pip"]
     limited = simulated(pip, case.plant, case.scenario)
     small, large = steps(limited)
     yield claim(
@@ -244,6 +253,9 @@ def _with_governor() -> Iterator[Claim]:
         0.05,
         "1 % of the set-point",
     )
+
+
+def _short_horizon() -> Iterator[Claim]:
     short = _governed(3)
     yield claim(
         "3.4, fig. 3.4",
@@ -375,6 +387,8 @@ def _tracking(case: cases.Case, design: Design) -> Iterator[Claim]:
     )
     short = dataclasses.replace(design, options={**design.options, "free_until": 6})
     ended = simulated(short, case.plant, case.scenario)
+    fewer = dataclasses.replace(design, options={**design.options, "free_until": 3})
+    few = simulated(fewer, case.plant, case.scenario)
     yield claim(
         "3.3",
         "beta zero after a step",
@@ -383,7 +397,8 @@ def _tracking(case: cases.Case, design: Design) -> Iterator[Claim]:
         ended.y[-1, 0],
         0.05,
         "1 % of the set-point",
-        note="with 5 free steps or fewer some programs have no solution",
+        note=f"with 3 free steps the program has no solution at "
+        f"{(few.status >= Status.CLIPPED).sum()} samples",
     )
     fading = dataclasses.replace(design, options={**design.options, "decay": 0.7})
     faded = steps(simulated(fading, case.plant, case.scenario))[1]
@@ -401,9 +416,12 @@ def _tracking(case: cases.Case, design: Design) -> Iterator[Claim]:
 TOPICS = (
     _form_3_1,
     _pip_gain,
+    _pip_poles,
     _without_governor,
+    _ungoverned_changes,
     _literal_increment,
     _with_governor,
+    _short_horizon,
     _governor_properties,
 )
 """Topics in the order of the text."""

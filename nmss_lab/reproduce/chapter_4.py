@@ -60,6 +60,10 @@ def _double_integrator() -> Iterator[Claim]:
         1e-12,
         "exact numbers, rounding",
     )
+
+
+def _figure_4_2() -> Iterator[Claim]:
+    case = case_of("double_integrator_4_4_1")
     run = simulated(case.designs["integral_of_error"], case.plant, case.scenario)
     yield claim(
         "4.4.1, fig. 4.2",
@@ -176,10 +180,32 @@ def _polynomial_form() -> Iterator[Claim]:
         )
 
 
-def _transfer_4(controller: PredictiveController, z: complex) -> dict[str, Array]:
-    """(4.18), (4.20), (4.21) with K_I = K_{m+n}."""
+def _polynomial_form_literal() -> Iterator[Claim]:
+    controller = built(case_of("shell_5_3_2").designs["integral_of_error"])
+    loop = linear_loop(controller)
+    gap = max(
+        np.abs(loop.transfer("S_o", z) - _transfer_4(controller, z, -1.0)["S_o"]).max()
+        for z in POINTS
+    )
+    yield claim(
+        "4.3.1, (4.21)",
+        "S_o(z), sign as printed",
+        "S_o(z) with K_{m+n} replaced by -K_I as printed, at the same points",
+        0.0,
+        gap,
+        1e-8,
+        "rounding",
+        because="the integral gain then has the wrong sign; see E4.2",
+    )
+
+
+def _transfer_4(
+    controller: PredictiveController, z: complex, sign: float = 1.0
+) -> dict[str, Array]:
+    """(4.18), (4.20), (4.21) with K_I = sign K_{m+n}."""
     parts = control_polynomials(controller)
-    P, L, K_I = value_at(parts.P, z), value_at(parts.L, z), -parts.K_I
+    P, L = value_at(parts.P, z), value_at(parts.L, z)
+    K_I = -sign * parts.K_I
     G, rate, one = controller.model.response(z), 1.0 - 1.0 / z, np.eye(len(K_I))
     ahead = controller.gain("r").reshape(len(K_I), -1, controller.model.n_y)
     R = np.einsum("i,qip->qp", z ** np.arange(1.0, ahead.shape[1] + 1), ahead)
@@ -213,6 +239,17 @@ def _ifac93_4() -> Iterator[Claim]:
         note=f"overshoot {100 * first.overshoot:.1f} %, settling "
         f"{first.settling:.2f} s",
     )
+    yield claim(
+        "4.4.2, fig. 4.3",
+        "input within +-5",
+        "the input stays within its limits",
+        True,
+        keeps_limits(run),
+    )
+
+
+def _ifac93_4_literal() -> Iterator[Claim]:
+    case = case_of("ifac93_4_4_2")
     literal = dataclasses.replace(case.designs["integral_of_error"], reference="held")
     held = steps(simulated(literal, case.plant, case.scenario))[0]
     yield claim(
@@ -223,13 +260,6 @@ def _ifac93_4() -> Iterator[Claim]:
         held.overshoot < 0.2,
         because=f"with S in the cost the overshoot is {100 * held.overshoot:.0f} %; "
         "see E4.1",
-    )
-    yield claim(
-        "4.4.2, fig. 4.3",
-        "input within +-5",
-        "the input stays within its limits",
-        True,
-        keeps_limits(run),
     )
     yield unchecked(
         "4.4.2, (4.23)",
@@ -322,10 +352,13 @@ def _against_wang(ours: Robust) -> Iterator[Claim]:
 
 TOPICS = (
     _double_integrator,
+    _figure_4_2,
     _steady_state_4,
     _limited_offset,
     _polynomial_form,
+    _polynomial_form_literal,
     _ifac93_4,
+    _ifac93_4_literal,
     _robust_4,
 )
 """Topics in the order of the text."""

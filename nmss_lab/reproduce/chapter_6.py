@@ -68,6 +68,12 @@ def _polynomial_form_6() -> Iterator[Claim]:
             "rounding",
             erratum=erratum,
         )
+
+
+def _polynomial_form_6_literal() -> Iterator[Claim]:
+    design = dataclasses.replace(cases.shell_designs()["wang_young"], reference="held")
+    feedback = built(design)
+    forward = built(dataclasses.replace(design, structure="forward_path"))
     unseen = linear_loop(forward)
     gap = max(
         np.abs(unseen.transfer("S_i", z) - _transfer_6(True, forward, z)["S_i"]).max()
@@ -161,6 +167,22 @@ def _steady_state_6() -> Iterator[Claim]:
     )
 
 
+def _limited_offset_6() -> Iterator[Claim]:
+    case = case_of("ifac93_6_3_3")
+    pushed = Scenario(np.ones(300), input_disturbance=cases.piecewise(300, (60, 3.0)))
+    run = simulated(case.designs["forward_path"], case.plant, pushed)
+    yield claim(
+        "6.2.3",
+        "Remark 6.2.1",
+        "with limits the forward path has no offset either; IFAC'93 plant, an input "
+        "disturbance of 3",
+        1.0,
+        run.y[-1, 0],
+        1e-6,
+        "300 samples, accuracy of the solver",
+    )
+
+
 def _stability_6() -> Iterator[Claim]:
     short = short_sighted("wang_young")
     yield claim(
@@ -188,6 +210,9 @@ def _stability_6() -> Iterator[Claim]:
         1e-9,
         "rounding",
     )
+
+
+def _feasibility() -> Iterator[Claim]:
     marginal = case_of("marginally_stable_6_3_2")
     limits = Limits(u=(-1.0, 1.0), y=(-0.5, 1.5))
     design = dataclasses.replace(marginal.designs["wang_young"], limits=limits)
@@ -357,6 +382,11 @@ def _figure_6_5() -> Iterator[Claim]:
         "1 % of the set-point",
         erratum="E6.3",
     )
+
+
+def _figure_6_5_unseen() -> Iterator[Claim]:
+    case = case_of("marginally_stable_6_3_2")
+    design = case.designs["forward_path"]
     unseen = dataclasses.replace(case.scenario, seen=False)
     swing = float(np.ptp(simulated(design, case.plant, unseen).y[50:80]))
     yield claim(
@@ -451,7 +481,6 @@ def _figure_6_7(before: Robust) -> Iterator[Claim]:
 
 
 def _gasifier() -> Iterator[Claim]:
-    case = case_of("gasifier_6_3_4")
     high = {"u1": 3.5, "u2": 20.0, "u3": 10.0, "u4": 6.0}
     names = ("WCHR", "WAIR", "WCOL", "WSTM")
     load = dict(zip(names, cases.GASIFIER_OPERATING_POINT, strict=True))
@@ -470,6 +499,10 @@ def _gasifier() -> Iterator[Claim]:
             because="coal at 100 % load, 8.55 kg/s, exceeds the limit 3.5 of u1; see "
             "E6.5",
         )
+
+
+def _gasifier_loop() -> Iterator[Claim]:
+    case = case_of("gasifier_6_3_4")
     free = dataclasses.replace(case.designs["wang_young_printed"], limits=Limits())
     loop = loop_of(free)
     zero = np.abs(case.model.zeros()).max()
@@ -506,13 +539,18 @@ def _gasifier() -> Iterator[Claim]:
 
 TOPICS = (
     _stability_6,
+    _feasibility,
     _polynomial_form_6,
+    _polynomial_form_6_literal,
     _steady_state_6,
+    _limited_offset_6,
     _monte_carlo,
     _recommendation,
     _figure_6_5,
+    _figure_6_5_unseen,
     _table_6_1,
     _ifac93_6,
     _gasifier,
+    _gasifier_loop,
 )
 """Topics in the order of the text."""

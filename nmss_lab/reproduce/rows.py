@@ -26,10 +26,10 @@ ERRATA: dict[str, str] = {
     "R(z) is multiplied by z^{+Np}",
     "E5.1": "w_z of 5.3.2.1 has its entries (2,2) and (2,3) interchanged",
     "E5.2": "Q(3,2) of 5.3.2.2 is 0.0050, not 0.0500",
-    "E5.3": "w_u(2,2) of row b is about 0.2575, not 0.005",
+    "E5.3": "w_u(2,2) of row b is about 0.2575, not 0.005; this value was chosen to fit "
+    "both entries of the row, which is therefore no independent check",
     "E5.4": "the totals of rows a and b of Table 5.2 are interchanged",
-    "E5.5": "the total of the minimal row of Table 5.2 is 10.0106",
-    "E5.6": "the example transfer function below Table 5.1 has time constant and dead "
+    "E5.5": "the example transfer function below Table 5.1 has time constant and dead "
     "time interchanged",
     "E6.1": "L(z) of 6.2.1 is the identity plus the terms in z^-1, not 1 in each row",
     "E6.2": "(6.5)-(6.7) are [first row]^-1 [second row]",
