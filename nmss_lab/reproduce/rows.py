@@ -26,7 +26,7 @@ ERRATA: dict[str, str] = {
     "R(z) is multiplied by z^{+Np}",
     "E5.1": "w_z of 5.3.2.1 has its entries (2,2) and (2,3) interchanged",
     "E5.2": "Q(3,2) of 5.3.2.2 is 0.0050, not 0.0500",
-    "E5.3": "w_u(2,2) of row b is about 0.2575, not 0.005; this value was chosen to fit "
+    "E5.3": "w_u(2,2) of row b is about 0.2575, not 0.005; it was chosen to fit "
     "both entries of the row, which is therefore no independent check",
     "E5.4": "the totals of rows a and b of Table 5.2 are interchanged",
     "E5.5": "the example transfer function below Table 5.1 has time constant and dead "
