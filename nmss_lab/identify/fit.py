@@ -22,7 +22,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from nmss_lab.identify.estimate import Estimate
-from nmss_lab.identify.noise import fit_noise
+from nmss_lab.identify.noise import fit_noise, long_autoregression
 from nmss_lab.identify.structure import (
     ONE,
     Noise,
@@ -310,7 +310,7 @@ class Work:
             orders=self.orders,
             parameters=p[:n],
             covariance=s2 * bread[:n, :n],
-            sandwich=(bread @ _weighted(Z, e, self.orders.reach) @ bread)[:n, :n],
+            sandwich=(bread @ _weighted(Z, e) @ bread)[:n, :n] * len(e) / (len(e) - n),
             record=self.record,
             method=method,
             passes=passes,
@@ -357,15 +357,13 @@ def inverse_product(Z: Array) -> Array:
     return (axes / values) @ axes.T / np.outer(size, size)
 
 
-def _weighted(Z: Array, e: Array, reach: int) -> Array:
-    """Newey and West's middle: instruments weighted by the errors' own correlation.
+def _weighted(Z: Array, e: Array) -> Array:
+    """Covariance of Z'e for coloured e: an autoregression of e, run backwards over Z.
 
-    Bartlett weights over the usual 4 (N / 100)^(2/9) lags and the equation's reach.
+    Z holds nothing of the noise, so that with e = w / C the products Z'e are sums of
+    the white w times Z filtered by 1 / C against time.
     """
-    scores = Z * e[:, None]
-    lags = min(int(4 * (len(Z) / 100.0) ** (2.0 / 9.0)) + reach, len(Z) - 1)
-    middle = scores.T @ scores
-    for lag in range(1, lags + 1):
-        product = scores[lag:].T @ scores[:-lag]
-        middle += (1.0 - lag / (lags + 1.0)) * (product + product.T)
-    return middle
+    c = long_autoregression(e)
+    w = np.asarray(lfilter(c, ONE, e))[len(c) - 1 :]
+    backwards = np.asarray(lfilter(ONE, c, Z[::-1], axis=0))
+    return np.mean(w**2) * (backwards.T @ backwards)

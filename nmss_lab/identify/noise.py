@@ -11,6 +11,9 @@ from nmss_lab.models import Array
 STEPS = 100
 """Bound on the Gauss-Newton steps for a moving average."""
 
+LONGEST = 20
+"""Highest order of an autoregression of residuals."""
+
 STILL = 1e-11
 """Largest step at which the noise model counts as converged."""
 
@@ -37,6 +40,28 @@ def fit_noise(xi: Array, noise: Noise) -> tuple[Array, Array]:
         if moved < STILL:
             break
     return _polynomials(theta, noise)
+
+
+def long_autoregression(e: Array) -> Array:
+    """Autoregression of a signal, its order chosen by Schwarz's criterion.
+
+    Orders up to a tenth of the samples and 20, by Levinson and Durbin's recursion on
+    the sample autocorrelation; the chosen one is fitted by least squares.
+    """
+    n, bound = len(e), min(LONGEST, len(e) // 10)
+    r = np.array([e[i:] @ e[: n - i] for i in range(bound + 1)])
+    c, power = ONE, float(r[0])
+    best, order = n * np.log(power) if power > 0.0 else -np.inf, 0
+    for i in range(1, bound + 1):
+        if not power > 0.0:
+            break
+        reflection = -(c @ r[i:0:-1]) / power
+        c = np.append(c, 0.0) + reflection * np.append(c, 0.0)[::-1]
+        power *= 1.0 - reflection**2
+        price = n * np.log(max(power, 1e-300)) + i * np.log(n)
+        if price < best:
+            best, order = price, i
+    return _autoregression(e, order)
 
 
 def _polynomials(theta: Array, noise: Noise) -> tuple[Array, Array]:
