@@ -366,6 +366,23 @@ def test_solvers_agree_on_the_worked_examples(name):
     assert compared > 0
 
 
+def test_warm_started_solver_neither_fails_nor_drifts():
+    """ProxQP from the last plan: once it called a sound program infeasible (106)."""
+    for seed in range(95, 110):
+        rng = np.random.default_rng(seed)
+        p, q = rng.integers(1, 3, 2)
+        model = random_model(rng, p, q, 0, 2, 2, 0, radius=rng.uniform(0.3, 1.0))
+        limits = Limits(u=(-1, 1), du=(-0.2, 0.2))
+        c = wang_young(model, Horizon(8, 4), 1.0, 0.1, limits, backend="proxqp")
+        r = np.repeat(rng.uniform(-3, 3, (2, p)), 6, 0)
+        run = closed_loop(model.plant(), c, Scenario(r))
+        assert (run.status <= Status.LIMITED).all(), f"seed {seed}"
+        for k in np.flatnonzero(run.status == Status.LIMITED):
+            cold = qp.solve(c.program, run.moves.known[k], "daqp")
+            u = c.first_move.value(cold.decision, run.moves.known[k])
+            assert u == pytest.approx(run.u[k], abs=DECISION), f"seed {seed}, k = {k}"
+
+
 def test_every_accepted_solution_meets_the_optimality_conditions():
     """Promise 4, computed here again from (2.5)."""
     for seed in range(200):
