@@ -198,7 +198,8 @@ def test_forward_path(model, sizes, reading, seed):
     z = rng.standard_normal(c.n_z)
     u = planned_u(model, horizon, z, h.u[-1], "du")
     inside = [np.zeros(model.n_y)]  # the model's own outputs, up to k
-    inside += roll_out(model, inside, [], [], h.u, h.v[:-1])
+    unseen = [np.zeros(model.n_v)] * len(h.u)  # it does not look at disturbances
+    inside += roll_out(model, inside, [], [], h.u, unseen)
     change, d_u = changes(inside), changes(h.u)
     level, y = h.y[-1], []
     for i in range(horizon.Np):
