@@ -1,5 +1,7 @@
 """Predictive control structures in the non-minimal state space."""
 
+import logging
+
 from nmss_lab.analysis import (
     LinearLoop,
     Review,
@@ -7,6 +9,7 @@ from nmss_lab.analysis import (
     linear_loop,
     review,
 )
+from nmss_lab.cases import CASES, Case, case
 from nmss_lab.continuous import ContinuousPlant, TransferFunction, difference_model
 from nmss_lab.controller import Controller, Limits, Memory, Move, Status
 from nmss_lab.design import Design
@@ -29,7 +32,9 @@ from nmss_lab.records import Record
 from nmss_lab.simulate import Run, Scenario, closed_loop, closed_loops, samples
 
 __all__ = [
+    "CASES",
     "STRUCTURES",
+    "Case",
     "ContinuousPlant",
     "Controller",
     "Design",
@@ -49,6 +54,7 @@ __all__ = [
     "Status",
     "TransferFunction",
     "__version__",
+    "case",
     "closed_loop",
     "closed_loops",
     "control_polynomials",
@@ -70,3 +76,6 @@ __all__ = [
 ]
 
 __version__ = "0.1.0"
+
+# Failures are told by each move's status; the log is for who asks for it.
+logging.getLogger(__name__).addHandler(logging.NullHandler())

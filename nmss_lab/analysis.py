@@ -233,7 +233,13 @@ class Finding:
 
 @dataclass(frozen=True)
 class Review:
-    """Findings about a design; printing it shows them line by line."""
+    """Findings about a design; printing it shows them line by line.
+
+    Parameters
+    ----------
+    findings : tuple of Finding
+        In the order in which things were looked at.
+    """
 
     findings: tuple[Finding, ...]
 
@@ -270,7 +276,7 @@ def review(
     findings = [_stability(loop), *_offset(loop), *_structure(controller)]
     if isinstance(controller, PredictiveController):
         findings += [_conditioning(controller), _dead_time(controller)]
-        findings += _rows_left_out(controller)
+        findings += _rows_left_out(controller) + _sum_of_error(controller)
     findings += _conflicts(controller)
     findings += _hidden(loop)
     return Review(tuple(findings))
@@ -333,6 +339,25 @@ def _structure(controller: Controller) -> list[Finding]:
         )
         findings.append(Finding("zeros", "note", sentence))
     return findings
+
+
+def _sum_of_error(controller: PredictiveController) -> list[Finding]:
+    """Say what weighing the sum of the error does to a step of the reference."""
+    if "integral" not in controller.form.recipe.layout or "w" in controller.signals:
+        return []
+    if controller.knowledge.layout.shapes["r"][0]:
+        sentence = (
+            "The weighed sum of the error has to return to zero, so a step of the "
+            "reference overshoots by as much as it lacked; "
+            'reference = "zero" leaves the reference to the integral action alone.'
+        )
+    else:
+        sentence = (
+            "The plan expects a reference of zero from the next sample on: without "
+            "limits it is the law of PIP control, but limits may seem active that the "
+            "loop never meets."
+        )
+    return [Finding("reference", "note", sentence)]
 
 
 def _conditioning(controller: PredictiveController) -> Finding:

@@ -74,6 +74,11 @@ class Case:
 def case(name: str) -> Case:
     """Build the case of that name.
 
+    Parameters
+    ----------
+    name : str
+        A key of ``CASES``.
+
     Raises
     ------
     ValueError

@@ -57,7 +57,7 @@ class TransferFunction:
     num, den : sequences of float
         Coefficients of descending powers of s.
     delay : float
-        Dead time, in the unit of time of the plant; not negative.
+        Dead time in seconds, or whatever unit of time num and den are in; not negative.
 
     Raises
     ------
@@ -236,7 +236,7 @@ class ContinuousPlant:
         Parameters
         ----------
         dt : float
-            Sampling interval, in the unit of time of the channels.
+            Sampling interval, in the unit of time of the channels: seconds or stated.
         substeps : int
             With more than one, outputs are also given, exactly, at this number of
             equally spaced times in an interval, its end included.
@@ -280,7 +280,7 @@ class ContinuousPlant:
         Parameters
         ----------
         dt : float
-            Sampling interval, in the unit of time of the channels.
+            Sampling interval, in the unit of time of the channels: seconds or stated.
 
         Returns
         -------

@@ -137,7 +137,7 @@ class Status(enum.IntEnum):
 
 _SENTENCES = {
     Status.FREE: "No limit is active: the linear law was applied.",
-    Status.LIMITED: "A limit is active: the quadratic program was solved.",
+    Status.LIMITED: "A limit is active in the plan: the quadratic program was solved.",
     Status.SOFTENED: "Output limits could not all be kept: they were relaxed.",
     Status.DROPPED: "Output limits could not be kept: they were dropped this sample.",
     Status.CLIPPED: "The law asked for more than the input can do: it was clipped.",

@@ -176,8 +176,14 @@ def minimal(
 ) -> PredictiveController:
     """Predictive control on a minimal realisation with an observer (5.1.3).
 
-    The cost is that of ``wang_young``; see ``nmss_lab.nmss.minimal_form`` for the
-    observers.
+    The cost is that of ``wang_young``.
+
+    Parameters
+    ----------
+    observer : "deadbeat" or "kalman"
+        See ``nmss_lab.nmss.minimal_form``.
+    model, horizon, Q, R, limits, reference, terminal, backend :
+        See ``wang_young``.
     """
     form = minimal_form(model, observer)
     return _incremental(
@@ -457,7 +463,11 @@ def state_weight(
 ) -> Array:
     """Weight (n_x, n_x) of the state of (3.2), by its parts: (5.6a).
 
-    Each part is a number, one weight a channel, or a matrix.
+    Parameters
+    ----------
+    model : DifferenceModel
+    weight_y, weight_past_u, weight_integral : weights of past outputs, past inputs, sum
+        Each a number, one weight a channel, a matrix, or one matrix a lag.
     """
     parts = [weight("weight_y", weight_y, model.na, model.n_y)]
     if model.nb > 1:

@@ -444,7 +444,9 @@ def _recipe(
     if "y_model" in layout:
         _push(layout, "y_model", carry, enter, None)
         newest = layout["y_model"].start
-        carry[newest : newest + p] = _one_step(model, layout, "y_model", "u_model")
+        simulated = _one_step(model, layout, "y_model", "u_model")
+        simulated[:, layout["v"]] = 0.0  # the prediction does not see v either
+        carry[newest : newest + p] = simulated
         _push(layout, "u_model", keep, store, slice(q, 2 * q))
     return Recipe(layout, carry, enter, keep, store, state, forecast)
 

@@ -94,8 +94,18 @@ class QuadraticProgram:
 
     @cached_property
     def free(self) -> Array:
-        """Gain (n_z, n_theta) of the optimum without limits, -H^-1 f."""
-        return -scipy.linalg.cho_solve(scipy.linalg.cho_factor(self.H), self.f)
+        """Gain (n_z, n_theta) of the optimum without limits, -H^-1 f.
+
+        Equalities to zero always hold, so the optimum is taken among what meets them,
+        unless they are more than the decision can meet.
+        """
+        free = -scipy.linalg.cho_solve(scipy.linalg.cho_factor(self.H), self.f)
+        equal = (self.lower == 0.0) & (self.upper == 0.0)
+        E, e = self.M[equal], self.offset[equal]
+        if not 0 < len(E) <= self.n_z or np.linalg.matrix_rank(E) < len(E):
+            return free
+        push = np.linalg.solve(self.H, E.T)
+        return free - push @ np.linalg.solve(E @ push, E @ free + e)
 
     @cached_property
     def rows(self) -> dict[str, Array]:

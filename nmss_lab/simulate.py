@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from nmss_lab.controller import Controller, Memory, Move, Status
-from nmss_lab.models import Array, LinearPlant, Numbers, Plant
+from nmss_lab.models import Array, DifferenceModel, LinearPlant, Numbers, Plant
 from nmss_lab.predictive import PredictiveController
 
 
@@ -23,7 +23,8 @@ class Scenario:
         r_k.  Beyond the end the last value is held; whether the controller reads ahead
         is the design's ``reference`` option.
     v : array (N, n_v), optional
-        Measured disturbances; v_k is measured before u_k is computed.
+        Measured disturbances; v_k is measured before u_k is computed.  A design with
+        ``forecast = "given"`` is handed the true future.
     input_disturbance, output_disturbance : arrays (N, n_u), (N, n_y), optional
         Not measured; added to the input of the plant, and to its output.
     noise : array (N, n_y), optional
@@ -193,14 +194,15 @@ class Sample:
 
 
 def samples(
-    plant: Plant, controller: Controller, scenario: Scenario
+    plant: Plant | DifferenceModel, controller: Controller, scenario: Scenario
 ) -> Iterator[Sample]:
     """Run the loop sample by sample; stop whenever you like.
 
     Parameters
     ----------
-    plant : Plant
-        A ``LinearPlant``, or anything with ``reset``, ``output`` and ``step``.
+    plant : Plant or DifferenceModel
+        A ``LinearPlant``, a model as its own plant, or anything with ``reset``,
+        ``output`` and ``step``.
     controller : Controller
     scenario : Scenario
 
@@ -214,8 +216,7 @@ def samples(
     ValueError
         If plant, controller and scenario do not fit together.
     """
-    ensemble = _Single(plant)
-    for sample in _lock_step(ensemble, controller, scenario):
+    for sample in _lock_step(_Single(plant), controller, scenario):
         move = Move(*(getattr(sample.move, n)[0] for n in Move.__dataclass_fields__))
         memory = Memory(
             *(getattr(sample.memory, n)[0] for n in Memory.__dataclass_fields__)
@@ -232,13 +233,15 @@ def samples(
         )
 
 
-def closed_loop(plant: Plant, controller: Controller, scenario: Scenario) -> Run:
+def closed_loop(
+    plant: Plant | DifferenceModel, controller: Controller, scenario: Scenario
+) -> Run:
     """Run the whole loop; see ``samples`` for the arguments and errors."""
     return _collect(_Single(plant), controller, scenario, keep_moves=True)[0]
 
 
 def closed_loops(
-    plants: Sequence[LinearPlant],
+    plants: Sequence[LinearPlant | DifferenceModel],
     controller: Controller,
     scenario: Scenario,
     keep_moves: bool = False,
@@ -250,7 +253,7 @@ def closed_loops(
 
     Parameters
     ----------
-    plants : sequence of LinearPlant
+    plants : sequence of LinearPlant or DifferenceModel
         With equal sizes, as from one model with varied parameters.
     controller, scenario : see ``samples``
     keep_moves : bool
@@ -267,14 +270,11 @@ def closed_loops(
 class _Single:
     """One plant of any kind as an ensemble of one."""
 
-    def __init__(self, plant: Plant) -> None:
+    def __init__(self, model: Plant | DifferenceModel) -> None:
+        plant: Plant = model.plant() if isinstance(model, DifferenceModel) else model
         self.plant, self.size = plant, 1
-        self.dt, self.n_y, self.n_u, self.n_v = (
-            plant.dt,
-            plant.n_y,
-            plant.n_u,
-            plant.n_v,
-        )
+        self.dt, self.n_y = plant.dt, plant.n_y
+        self.n_u, self.n_v = plant.n_u, plant.n_v
         self.times = _times(plant)
 
     def reset(self, u0: Array, v0: Array, y0: Array | None) -> Any:
@@ -298,9 +298,10 @@ class _Single:
 class _Stacked:
     """Linear plants of equal size, their matrices stacked."""
 
-    def __init__(self, plants: Sequence[LinearPlant]) -> None:
-        if not plants:
+    def __init__(self, models: Sequence[LinearPlant | DifferenceModel]) -> None:
+        if not models:
             raise ValueError("plants is empty, expected at least one LinearPlant")
+        plants = [m.plant() if isinstance(m, DifferenceModel) else m for m in models]
         first = plants[0]
         self.plants, self.size = list(plants), len(plants)
         self.dt, self.n_y, self.n_u, self.n_v = (

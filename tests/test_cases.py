@@ -269,7 +269,7 @@ def test_simulate_prints_measures(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["simulate", "governor_3_4", "--structure", "governor"]) == 0
     text = capsys.readouterr().out
     assert "82.75" in text
-    assert "of 60: A limit is active" in text
+    assert "of 60: A limit is active in the plan" in text
 
 
 def test_simulate_writes_a_record(tmp_path: Path) -> None:

@@ -102,7 +102,13 @@ def table(rows: Sequence[Claim]) -> str:
     """Text with a block a row and the counts of the verdicts at the end."""
     blocks = [_block(row) for row in rows]
     counts = collections.Counter(row.kind for row in rows)
-    summary = ", ".join(f"{counts[kind]} {kind}" for kind in sorted(counts))
+    words = {
+        "reproduced": "reproduced",
+        "reproduced after": "reproduced after an erratum",
+        "differs": "differ",
+        "cannot": "cannot be checked",
+    }
+    summary = ", ".join(f"{counts[kind]} {words[kind]}" for kind in words)
     return "\n".join([*blocks, f"{len(rows)} rows: {summary}"])
 
 
