@@ -1,4 +1,4 @@
-"""The command ``nmss-lab``: serve the live pages, reproduce the thesis, simulate.
+"""The command ``nmss-lab``: serve pages, reproduce the thesis, simulate, identify.
 
 Numerical and page libraries are imported inside the commands that need them, so
 that ``--version`` and ``--help`` answer at once.
@@ -55,6 +55,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_serve(commands)
     _add_reproduce(commands)
     _add_simulate(commands)
+    _add_identify(commands)
     return parser
 
 
@@ -81,6 +82,119 @@ def _add_simulate(commands: Any) -> None:
     simulate.add_argument("--structure", help="name of a structure")
     simulate.add_argument("--csv", metavar="FILE", help="write the run to FILE")
     simulate.set_defaults(command=_simulate)
+
+
+def _add_identify(commands: Any) -> None:
+    identify = commands.add_parser(
+        "identify", help="rank models of one output of a record and write the best"
+    )
+    add = identify.add_argument
+    add("file", help="record: .csv, .mat, .xlsx or .parquet")
+    add("--inputs", type=_names, required=True, help="column names, with commas")
+    add("--output", required=True, help="column name")
+    add("--disturbances", type=_names, default=(), help="measured, with commas")
+    clock = identify.add_mutually_exclusive_group(required=True)
+    clock.add_argument("--time", help="column of seconds or of ISO dates")
+    clock.add_argument("--dt", type=float, help="interval, if there is no such column")
+    add("--skip-bad", action="store_true", help="leave out rows that are no numbers")
+    add("--resample", type=float, metavar="DT", help="read at regular times")
+    add(
+        "--detrend",
+        choices=("first", "output", "constant", "linear", "none"),
+        default="first",
+        help="subtract first values (of the output alone), means, lines or nothing",
+    )
+    starts = "rest", "skip", "estimate"
+    add("--start", choices=starts, default="rest", help="state before the record")
+    add("--na", type=_range, default=(1, 2, 3), help="past outputs, such as 1-3")
+    add("--nb", type=_range, default=(1, 2, 3), help="coefficients an input")
+    add("--nk", type=_range, default=(1, 2, 3, 4, 5), help="delay of each input")
+    add("--noise", type=_range, metavar="AR[,MA]", help="noise model: RIV, not SRIV")
+    add("--model", metavar="FILE", help="write the best estimate, with covariance")
+    identify.set_defaults(command=_identify)
+
+
+def _names(text: str) -> tuple[str, ...]:
+    return tuple(name.strip() for name in text.split(",") if name.strip())
+
+
+def _range(text: str) -> tuple[int, ...]:
+    """Whole numbers out of "1-3", "2" or "1,3"."""
+    found: list[int] = []
+    for part in text.split(","):
+        first, _, last = part.partition("-")
+        found += range(int(first), int(last or first) + 1)
+    return tuple(found)
+
+
+def _identify(arguments: argparse.Namespace) -> None:
+    """Fit every structure, print the ranking and the best model, and write it."""
+    identify = importlib.import_module("nmss_lab.identify")
+    record = _record(arguments)
+    noise = identify.Noise(*arguments.noise) if arguments.noise else None
+    print(f"{len(record.time)} samples every {record.dt:g}", *record.notes, sep="; ")
+    ranked = identify.order_search(
+        record,
+        arguments.na,
+        arguments.nb,
+        arguments.nk,
+        noise,
+        start=arguments.start,
+    )
+    _print_ranking(ranked)
+    best = ranked[0]
+    if best.estimate is None or best.problem:
+        raise ValueError(f"no structure gave a model to trust; {best.problem}")
+    _print_estimate(best.estimate)
+    if arguments.model:
+        importlib.import_module("nmss_lab.files").save(arguments.model, best.estimate)
+
+
+def _record(arguments: argparse.Namespace) -> Any:
+    """Record as the arguments ask for it."""
+    record = importlib.import_module("nmss_lab.records").Record.from_file(
+        arguments.file,
+        y=[arguments.output],
+        u=arguments.inputs,
+        v=arguments.disturbances,
+        time=arguments.time,
+        dt=arguments.dt,
+        bad="skip" if arguments.skip_bad else "refuse",
+    )
+    if arguments.resample:
+        record = record.resample(arguments.resample)
+    if arguments.detrend == "output":
+        return record.detrend("first", ["y"])
+    return record if arguments.detrend == "none" else record.detrend(arguments.detrend)
+
+
+def _print_ranking(ranked: Sequence[Any]) -> None:
+    print("\n" + _line(["orders [na nb nk]", "YIC", "BIC", "R_T^2", "parameters"]))
+    for candidate in ranked[:ROWS]:
+        row = candidate.row
+        values = (f"{row[name]:.5g}" for name in ("yic", "bic", "r2_t", "parameters"))
+        print(f"{_line([row['orders'], *values])}  {row['problem']}".rstrip())
+    if len(ranked) > ROWS:
+        failed = sum(bool(candidate.problem) for candidate in ranked)
+        print(f"... of {len(ranked)} structures, {failed} of them not to be trusted")
+    sparing = min(ranked, key=lambda c: (bool(c.problem), c.row["bic"]))
+    print(f"YIC prefers {ranked[0].orders}, BIC {sparing.orders}")
+
+
+def _print_estimate(estimate: Any) -> None:
+    print(f"\n{estimate.method} {estimate.orders}, {estimate.passes} passes")
+    errors = estimate.standard_errors
+    values = zip(estimate.names, estimate.parameters, errors, strict=True)
+    derived = ((name, *pair) for name, pair in estimate.derived().items())
+    for name, value, error in (*values, *derived):
+        print(_line([name, f"{value:.5g}", f"+- {error:.2g}"]))
+    correlation, band = estimate.autocorrelation()
+    outside = int((abs(correlation[1:]) > band).sum())
+    print(f"{outside} of {len(correlation) - 1} autocorrelations outside the 95 % band")
+
+
+ROWS = 20
+"""Rows of a ranking that are printed."""
 
 
 def _reproduce(arguments: argparse.Namespace) -> None:

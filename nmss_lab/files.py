@@ -1,4 +1,4 @@
-"""Designs, records and runs as one small JSON file that gives the same numbers.
+"""Designs, records, estimates and runs in a small JSON file, to the last digit.
 
 Numbers are written with all their digits; infinite and missing ones as "inf", "-inf"
 and "nan".  Nothing but data is read: no code, no class outside the list below.
@@ -18,6 +18,7 @@ import numpy as np
 from nmss_lab.continuous import ContinuousPlant, TransferFunction
 from nmss_lab.controller import Limits, Move
 from nmss_lab.design import Design
+from nmss_lab.identify import Estimate, Noise, Orders
 from nmss_lab.models import Array, Between, DifferenceModel, LinearPlant
 from nmss_lab.predict import Horizon
 from nmss_lab.records import Record
@@ -59,6 +60,9 @@ KINDS: dict[str, type] = {
         Horizon,
         Limits,
         Record,
+        Orders,
+        Noise,
+        Estimate,
         Scenario,
         Run,
         Move,
@@ -67,8 +71,8 @@ KINDS: dict[str, type] = {
 """What a file may hold."""
 
 
-def save(path: str | Path, content: Study | Design | Record) -> None:
-    """Write a study, a design or a record; the old file stays if writing fails.
+def save(path: str | Path, content: Study | Design | Record | Estimate) -> None:
+    """Write a study, design, record or estimate; the old file stays if writing fails.
 
     Raises
     ------
@@ -100,7 +104,7 @@ def load(path: str | Path) -> Any:
     return loads(Path(path).read_text(encoding="utf-8"))
 
 
-def dumps(content: Study | Design | Record) -> str:
+def dumps(content: Study | Design | Record | Estimate) -> str:
     """Text of the file for ``content``; see ``save``."""
     return json.dumps(
         {"nmss_lab": SCHEMA, "content": _encode(content, "content")}, allow_nan=False

@@ -218,7 +218,7 @@ class Record:
             )
         return float(self.time[-1] - self.time[0]) / (self.time.size - 1)
 
-    def detrend(self, kind: Trend) -> Record:
+    def detrend(self, kind: Trend, groups: Sequence[str] = ("y", "u", "v")) -> Record:
         """Subtract from every column its mean, straight line or first value.
 
         Parameters
@@ -227,6 +227,9 @@ class Record:
             What is taken away: the mean, the least-squares line, or the value at the
             first sample.  A reference loses the trend of its output, so that control
             errors stay what they were.
+        groups : sequence of "y", "u", "v"
+            Which columns; inputs that already are deviations from rest, as of a step
+            at the first sample, are to be left alone.
 
         Returns
         -------
@@ -239,12 +242,18 @@ class Record:
         >>> record.detrend("first").r.ravel()
         array([3., 3., 3.])
         """
+        if not set(groups) <= {"y", "u", "v"}:
+            raise ValueError(f'groups = {groups}: expected some of "y", "u", "v"')
         if kind not in _TRENDS:
             raise ValueError(f"kind is {kind!r}; expected one of {tuple(_TRENDS)}")
         trend = _TRENDS[kind]
-        y, u, v = (trend(self.time, signal) for signal in (self.y, self.u, self.v))
-        r = self.r - y if self.r.size else self.r
-        return replace(self, y=self.y - y, u=self.u - u, v=self.v - v, r=r)
+        parts = {
+            group: getattr(self, group) - trend(self.time, getattr(self, group))
+            for group in groups
+        }
+        if self.r.size and "y" in parts:
+            parts["r"] = self.r - (self.y - parts["y"])
+        return replace(self, **parts)
 
     def select(self, start: float | None = None, stop: float | None = None) -> Record:
         """Keep the samples with start <= time < stop (None: no bound).

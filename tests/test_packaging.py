@@ -17,7 +17,7 @@ from packaging.utils import canonicalize_name
 
 import nmss_lab
 
-COMMANDS = ["serve", "reproduce", "simulate"]
+COMMANDS = ["serve", "reproduce", "simulate", "identify"]
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))[
     "project"

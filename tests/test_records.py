@@ -163,6 +163,11 @@ def test_detrending_removes_exactly_that_trend():
     assert not first.v[0].any()
     for kept in (constant, linear, first):
         assert np.allclose(kept.r - kept.y, record.r - record.y, rtol=0, atol=1e-15)
+    alone = record.detrend("first", ["y"])
+    assert np.array_equal(alone.u, record.u)
+    assert np.array_equal(alone.y, first.y)
+    with pytest.raises(ValueError, match="expected some of"):
+        record.detrend("first", ["r"])
     with pytest.raises(ValueError, match="'quadratic'"):
         record.detrend("quadratic")
 

@@ -41,7 +41,7 @@ CONVERGED = 1e-8
 """Change of the parameters at which the passes stop, as a share of the largest, each
 weighted by the size of what it multiplies."""
 
-FREE = 50
+FREE = 25
 """Bound on the passes of refined instrumental variables."""
 
 GUARDED = 150
@@ -205,7 +205,7 @@ class Work:
         )
 
     def descend(self, p: Array, c: Array, d: Array) -> Array:
-        """One Gauss-Newton step, halved until it lowers the residuals of a stable A.
+        """One Gauss-Newton step, of a length that lowers the residuals of a stable A.
 
         Its fixed points are those of ``refine``: the instruments are the slopes of the
         innovations.
@@ -216,15 +216,15 @@ class Work:
             If no part of the step does.
         """
         Z, Phi, y = self.filtered(p, c, d)
-        size = _norms(Z)
-        step, *_ = np.linalg.lstsq(Z / size, y - Phi @ p, rcond=None)
-        step = step / size
-        least = self.cost(p, c, d) * (1.0 + 1e-12)
-        for _ in range(HALVINGS):
-            new = p + step
-            if is_stable(self.orders.split(new)[0]) and self.cost(new, c, d) <= least:
+        size, e = _norms(Z), y - Phi @ p
+        step = np.linalg.lstsq(Z / size, e, rcond=None)[0] / size
+        now = self.cost(p, c, d)
+        best = _lowest(now, -2.0 * float(step @ (Z.T @ e)), self.cost(p + step, c, d))
+        for length in (best, *0.5 ** np.arange(HALVINGS)):
+            new = p + length * step
+            stable = is_stable(self.orders.split(new)[0])
+            if stable and self.cost(new, c, d) <= now * (1.0 + 1e-12):
                 return new
-            step = step / 2.0
         raise np.linalg.LinAlgError("no step lowers the residuals")
 
     def cost(self, p: Array, c: Array, d: Array) -> float:
@@ -342,6 +342,12 @@ def _check(record: Record, orders: Orders, start: Start) -> None:
                 f"input {name} is constant: nothing can be learnt of it, unless it "
                 'stepped from zero at the first sample (start = "rest")'
             )
+
+
+def _lowest(now: float, slope: float, there: float) -> float:
+    """Length of a step at the bottom of the parabola through its ends."""
+    bend = there - now - slope
+    return float(np.clip(-slope / (2.0 * bend), 0.1, 10.0)) if bend > 0.0 else 1.0
 
 
 def _norms(columns: Array) -> Array:
