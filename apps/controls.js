@@ -24,6 +24,7 @@ export function render({ model, el }) {
   let sent = 0
   let address = 0
   let painted = () => {}
+  let busy = 0
   const open = {}
   const update = {}    // name -> function that shows a value
   const form = element("form", { class: "choices", "aria-label": "Choices" })
@@ -37,6 +38,7 @@ export function render({ model, el }) {
   const send = () => {
     if (waiting !== null) { changed = true; return }
     changed = false
+    busy = setTimeout(() => { document.documentElement.dataset.busy = "" }, 300)
     const left = performance.now()
     painted = () => {
       latency.push(performance.now() - left)
@@ -177,6 +179,8 @@ export function render({ model, el }) {
     const answer = model.state.message
     if (waiting !== null && answer < waiting) return
     waiting = null
+    clearTimeout(busy)
+    delete document.documentElement.dataset.busy
     const done = painted
     requestAnimationFrame(() => setTimeout(done, 0))
     if (changed) { send(); return }

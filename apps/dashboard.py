@@ -1,6 +1,7 @@
 """Entry point of the live pages: which there are, and the index of them."""
 
 import html
+import logging
 from collections.abc import Callable
 
 import panel as pn
@@ -58,6 +59,8 @@ def pages() -> dict[str, Callable[[], Viewable]]:
     keep the others waiting.
     """
     pn.config.nthreads = THREADS
+    # Limits that cannot all be kept are an ordinary sight here; the page tells of them.
+    logging.getLogger("nmss_lab").setLevel(logging.ERROR)
     return {
         "": index,
         "receding_horizon": receding_horizon.page,

@@ -63,6 +63,7 @@ export function render({ model, el }) {
   }
   const play = (on) => {
     playing = on
+    status.setAttribute("aria-live", on ? "off" : "polite")
     if (on && time >= last()) time = 0
     toggle.replaceChildren(icon(on ? "pause" : "play"))
     const label = on ? "Pause (space)" : "Play (space)"

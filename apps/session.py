@@ -72,7 +72,8 @@ class Choices(param.Parameterized):
         20,
         bounds=(1, 80),
         label="Prediction horizon Np",
-        doc="Number of samples Np over which the controller predicts.",
+        doc="Number of samples Np over which the controller predicts; weights given "
+        "along the horizon keep their own.",
     )
     limit_u = param.Selector(
         default="case",
@@ -527,18 +528,39 @@ class LoopChoices(Choices):
         reading = design.reference if self.reading == "case" else self.reading
         return replace(
             design,
-            horizon=Horizon(self.Np, self.Nc),
+            horizon=self._horizon(design),
             Q=self.weight_y * np.asarray(design.Q),
             R=self.weight_move * np.asarray(design.R),
             limits=self.limits(design.limits),
             reference=reading,
         )
 
+    def _horizon(self, design: Design) -> Horizon:
+        """Choose the horizons; weights given along the horizon keep theirs."""
+        single = design.model.n_y == 1
+        along = single and np.ndim(design.Q) == 1 and np.size(design.Q) > 1
+        return design.horizon if along else Horizon(self.Np, self.Nc)
+
+    def _horizon_lines(self) -> tuple[list[str], str]:
+        """Lines before the loop of a script, and the horizon inside it."""
+        chosen = f"Horizon({self.Np}, {self.Nc})"
+        designs = {name: self.example.designs[name] for name in self.structures}
+        own = ", ".join(
+            f'"{name}": Horizon({design.horizon.Np}, {design.horizon.Nc})'
+            for name, design in designs.items()
+            if self._horizon(design) is design.horizon
+        )
+        if not own:
+            return [], chosen
+        return [f"own = {{{own}}}"], f"own.get(name, {chosen})"
+
     def _design_lines(self) -> list[str]:
+        before, horizon = self._horizon_lines()
         reading = (
             [] if self.reading == "case" else [f'        reference="{self.reading}",']
         )
         return [
+            *before,
             "runs = {}",
             f"for name in {list(self.structures)!r}:",
             "    design = example.designs[name]",
@@ -546,7 +568,7 @@ class LoopChoices(Choices):
             *self._limit_lines(),
             "    design = replace(",
             "        design,",
-            f"        horizon=Horizon({self.Np}, {self.Nc}),",
+            f"        horizon={horizon},",
             f"        Q={self.weight_y!r} * np.asarray(design.Q),",
             f"        R={self.weight_move!r} * np.asarray(design.R),",
             "        limits=limits,",

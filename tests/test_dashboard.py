@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
+import param
 import pytest
 from conftest import REPLAY, Server
 from playwright.sync_api import Browser, Page, expect
@@ -23,6 +24,9 @@ PAGES = ["receding_horizon", "governor"]
 SUBJECTS = [receding_horizon.SUBJECT, governor.SUBJECT]
 QUICK = "case=governor_3_4"
 """A small case, so that tests of the form wait little."""
+
+SLOW = "gasifier_6_3_4", "temperature_7_4_2"
+"""Cases with many channels and samples: about a second a run at long horizons."""
 
 # --- Choices, without a browser ----------------------------------------------------
 
@@ -87,6 +91,10 @@ def test_every_case_opens(subject: Subject) -> None:
                 "gain": -10.0,
             },
         ),
+        (
+            LoopChoices,
+            {"structures": "wang_young,forward_path_optimised", "Np": 30},
+        ),
         (LoopChoices, {"case": "quadruple_tank_minus", "output": 1, "step_u": 0.1}),
         (
             GovernorChoices,
@@ -150,6 +158,42 @@ def test_unstable_loop_is_a_message() -> None:
     choices = LoopChoices(case="marginally_stable_6_3_2", gain=50.0, dynamics=20.0)
     with pytest.raises(ValueError, match="unstable"):
         choices.runs()
+
+
+def anything(choices: Choices, rng: np.random.Generator) -> None:
+    """Put every choice anywhere within its bounds, often at an end."""
+    for item in (item for group in choices.description() for item in group["items"]):
+        name, parameter = item["name"], choices.param[item["name"]]
+        if item["kind"] in ("linear", "log"):
+            low, high = parameter.bounds
+            values = [low, high, rng.uniform(low, high), getattr(choices, name)]
+            value = values[rng.integers(4)]
+            whole = isinstance(parameter, param.Integer)
+            setattr(choices, name, int(value) if whole else float(value))
+        elif item["kind"] == "one" and name != "case":
+            options = [value for value, _ in item["options"]]
+            setattr(choices, name, options[rng.integers(len(options))])
+
+
+@pytest.mark.parametrize("subject", SUBJECTS, ids=PAGES)
+@pytest.mark.filterwarnings("error")
+def test_any_combination_is_drawn_or_explained(
+    subject: Subject, rng: np.random.Generator
+) -> None:
+    """Whatever is chosen, there is a finite picture or a sentence, nothing else."""
+    cases = [n for n in subject.choices.cases() if n not in SLOW]
+    drawn = 0
+    for number in range(60):
+        choices = subject.choices(case=cases[number % len(cases)])
+        anything(choices, rng)
+        try:
+            runs = choices.runs()
+        except ValueError:
+            continue
+        packed = pack(subject.charts(runs, choices.output, choices.input))
+        assert np.isfinite(packed["data"]).all()
+        drawn += 1
+    assert drawn > 10
 
 
 def test_names_are_text() -> None:
@@ -499,9 +543,13 @@ def test_controls_have_names(visit: Open, path: str) -> None:
 
 def test_python_is_shown(visit: Open) -> None:
     """The page shows Python that names its case and its horizon."""
-    page = visit(f"receding_horizon?{QUICK}&Np=17")
+    allowed = ["clipboard-read", "clipboard-write"]
+    page = visit(f"receding_horizon?{QUICK}&Np=17", permissions=allowed)
     page.get_by_text("The Python that computes this").click()
     code = page.locator("pre").inner_text()
+    page.get_by_role("button", name="Copy").click()
+    expect(page.get_by_role("button", name="Copied")).to_be_visible()
+    assert page.evaluate("navigator.clipboard.readText()") == code
     assert 'case("governor_3_4")' in code
     assert "Horizon(17, 5)" in code
 
