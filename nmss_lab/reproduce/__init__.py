@@ -9,12 +9,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 
-from nmss_lab.reproduce import chapter_3, chapter_4, chapter_5, chapter_6, chapter_7
+from nmss_lab.reproduce import (
+    chapter_2,
+    chapter_3,
+    chapter_4,
+    chapter_5,
+    chapter_6,
+    chapter_7,
+)
 from nmss_lab.reproduce.rows import ERRATA, Claim, table
 
 __all__ = ["CHAPTERS", "ERRATA", "Claim", "claims", "table"]
 
 CHAPTERS: dict[int, tuple[Callable[[], Iterator[Claim]], ...]] = {
+    2: chapter_2.TOPICS,
     3: chapter_3.TOPICS,
     4: chapter_4.TOPICS,
     5: chapter_5.TOPICS,

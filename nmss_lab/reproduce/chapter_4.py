@@ -261,12 +261,6 @@ def _ifac93_4_literal() -> Iterator[Claim]:
         because=f"with S in the cost the overshoot is {100 * held.overshoot:.0f} %; "
         "see E4.1",
     )
-    yield unchecked(
-        "4.4.2, (4.23)",
-        "identified model",
-        "the model (4.23) follows from open-loop data by SRIV",
-        "this version has no identification yet",
-    )
 
 
 def _robust_4() -> Iterator[Claim]:

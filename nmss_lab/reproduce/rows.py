@@ -16,6 +16,10 @@ Value = bool | int | float | str | tuple[float, ...] | None
 
 
 ERRATA: dict[str, str] = {
+    "E2.1": "(4.23) is the model of an output read half a sample after the held input "
+    "changed, or of an input that moves on a line between samples",
+    "E2.2": "rows 1 and 2 of (5.7) belong to dead times about 8.54 s shorter than "
+    "those of Table 5.1; the shift was chosen to fit, one number for 24 coefficients",
     "E3.1": "in 3.4 the first input coefficient is -1 as in (6.10), not -0.5",
     "E3.2": "the state of (3.2) has (n+1)p + (m-1)q entries",
     "E3.3": "(3.13b): the lower branch adds the lower limit, and the tests are on "
