@@ -94,6 +94,10 @@ def case(name: str) -> Case:
     return CASES[name]()
 
 
+AS_PRINTED = {"anti_windup": False}
+"""The thesis sums the error on while the input is at a limit."""
+
+
 def predictive(design: Design, *structures: str) -> dict[str, Design]:
     """Design with each of the structures, all else equal."""
     return {name: dataclasses.replace(design, structure=name) for name in structures}
@@ -168,6 +172,7 @@ def double_integrator_4_4_1() -> Case:
         "integral_of_error", model, Horizon(5, 3), 5 / 15, 1 / 3, limits, "zero"
     )
     mpc = dataclasses.replace(design, Q=1.0, R=1.0, reference="held")
+    design = dataclasses.replace(design, options=AS_PRINTED)
     K = lq_gain(model, 5 / 15, 1 / 3)
     pip = Design("pip", model, limits=limits, options={"K": K})
     return Case(
@@ -293,6 +298,7 @@ def ifac93_4_4_2() -> Case:
         "integral_of_error", model, Horizon(50, 10), 1.0, 0.1, limits, "zero"
     )
     mpc = dataclasses.replace(design, Q=0.085, reference="held")
+    design = dataclasses.replace(design, options=AS_PRINTED)
     K = lq_gain(model, 1.0, 0.1)
     return Case(
         name="ifac93_4_4_2",

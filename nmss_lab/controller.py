@@ -143,7 +143,7 @@ _SENTENCES = {
     Status.CLIPPED: "The law asked for more than the input can do: it was clipped.",
     Status.REFUSED: "A measurement was not a number: the last plan was continued.",
     Status.SHIFTED: "The solver failed: the last plan was continued and clipped.",
-    Status.HELD: "There was no plan to continue: the last input was held.",
+    Status.HELD: "There was no plan worth continuing: the last input was held.",
 }
 
 

@@ -336,7 +336,8 @@ class DifferenceModel:
         Before the first sample, u and v are zero and y is ``y0`` (zero by default).
         """
         u = np.asarray(u, dtype=float).reshape(len(u), self.n_u)
-        v = np.zeros((len(u), self.n_v)) if v is None else v.reshape(len(u), self.n_v)
+        v = np.zeros((len(u), self.n_v)) if v is None else np.asarray(v, dtype=float)
+        v = v.reshape(len(u), self.n_v)
         plant = self.plant()
         rest = np.zeros(self.n_y) if y0 is None else np.atleast_1d(y0)
         state = plant.reset(np.zeros(self.n_u), np.zeros(self.n_v), rest)

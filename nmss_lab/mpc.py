@@ -8,6 +8,7 @@ shared.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
@@ -57,6 +58,7 @@ def integral_of_error(
     reference: Reading = "held",
     terminal: Terminal = "none",
     backend: str = "daqp",
+    anti_windup: bool = True,
 ) -> PredictiveController:
     r"""Predictive control with an integral-of-error state (thesis 4.2).
 
@@ -80,6 +82,9 @@ def integral_of_error(
         ``"lq"`` weighs the last state with the infinite-horizon LQ cost.
     backend : str
         Solver, see ``nmss_lab.qp.BACKENDS``.
+    anti_windup : bool
+        While a level limit holds the input, set the sum of the error to what the law
+        without limits would need for that input.  The thesis sums on regardless.
 
     Raises
     ------
@@ -102,7 +107,8 @@ def integral_of_error(
     first = np.eye(horizon.Np * model.n_u, model.n_u)
     last_u = first @ known_part(problem.known, "u", problem.n_z)
     dU = difference(horizon.Np, model.n_u) @ U - last_u
-    return problem.build(costs, U, dU, X, limits, terminal, backend)
+    built = problem.build(costs, U, dU, X, limits, terminal, backend)
+    return replace(built, anti_windup=anti_windup)
 
 
 def wang_young(
@@ -401,6 +407,11 @@ class _Setup:
             limit("y", Y, limits.of("y", model.n_y), steps),
         ]
         if terminal == "equality":
+            if self.reading == "zero":
+                raise ValueError(
+                    'terminal = "equality" with reference = "zero" asks for rest at '
+                    "zero, not at the reference: use another reading"
+                )
             rows.append(self._rest(Y, dU))
         elif terminal not in ("none", "lq"):
             raise ValueError(

@@ -59,6 +59,8 @@ class PredictiveController(Controller):
         -1 for rows that never do.
     backend : str
     forecast : "held", "given" or a function, see ``Forecast``
+    anti_windup : bool
+        Whether a sum of the error stops growing while a level limit holds the input.
     """
 
     horizon: Horizon
@@ -68,6 +70,7 @@ class PredictiveController(Controller):
     ranks: Array
     backend: str = "daqp"
     forecast: Forecast = "held"
+    anti_windup: bool = True
 
     @property
     def n_z(self) -> int:
@@ -133,6 +136,20 @@ class PredictiveController(Controller):
         shift = np.maximum(np.asarray(move.shift), 0)[..., None]
         step = np.minimum(np.arange(self.horizon.Np) + shift, self.horizon.Np - 1)
         return np.take_along_axis(plan, step[..., None], axis=-2)
+
+    def _missed(self, memory: Memory, u: Array, move: Move) -> Array:
+        """As ``Controller._missed``, and where a level limit holds the input."""
+        missed = super()._missed(memory, u, move)
+        if not self.anti_windup:
+            return missed
+        r = np.tile(self.form.recipe.layout.read(memory.vector, "r"), 1 + self.preview)
+        free = self._free_move(memory.vector, r)
+        low, high = self.limits_u
+        held = ((free > high) & np.isclose(u, high)) | (
+            (free < low) & np.isclose(u, low)
+        )
+        held = held.any(axis=-1, keepdims=True)
+        return np.where(held, u - free, missed)
 
     def _decide(self, memory: Memory, r: Array, v: Array) -> Move:
         theta = self._known(memory.vector, r, v)
@@ -207,8 +224,12 @@ class PredictiveController(Controller):
     def _continue(
         self, move: Move, memory: Memory, i: int, before: Array, status: Status
     ) -> None:
-        """Fall back on the last plan, or hold the input where there is none."""
-        if memory.shift[i] < 0:
+        """Fall back on the last plan, or hold the input where there is none.
+
+        A plan that knows no reference (reading "zero") leads away from it: better hold.
+        """
+        aimless = self.knowledge.layout.shapes["r"][0] == 0
+        if memory.shift[i] < 0 or aimless:
             move.decision[i] = 0.0
             move.u[i], move.status[i], move.shift[i] = before, Status.HELD, -1
             return
@@ -298,8 +319,9 @@ class PredictiveController(Controller):
             solution = solve(program, theta, self.backend, free)
             if not solution.found:
                 return solution, Status.SHIFTED
-            missed = np.abs(solution.decision[self.n_z :]) + 1e-7
-            low[rows], high[rows] = low[rows] - missed, high[rows] + missed
+            missed, margin = solution.decision[self.n_z :], 1e-7
+            low[rows] -= np.maximum(missed, 0.0) + margin
+            high[rows] += np.maximum(-missed, 0.0) + margin
         solution = solve(self.program, theta, self.backend, (low, high))
         return solution, Status.SOFTENED
 

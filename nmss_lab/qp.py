@@ -505,9 +505,8 @@ def _through_qpsolvers(name: str) -> Backend:
         low, high = np.isfinite(problem.lower), np.isfinite(problem.upper)
         G = np.vstack([problem.M[high], -problem.M[low]])
         h = np.concatenate([problem.upper[high], -problem.lower[low]])
-        rows = (G, h) if len(h) else (None, None)  # some solvers stumble over no rows
         solution = qpsolvers.solve_problem(
-            qpsolvers.Problem(problem.H, problem.f, *rows), solver=name
+            qpsolvers.Problem(problem.H, problem.f, G, h), solver=name
         )
         multipliers = np.zeros(len(problem.lower))
         if solution.found and solution.z is not None:

@@ -575,6 +575,35 @@ def test_trail_of_a_controller_without_predictions_is_refused():
         closed_loop(MODEL.plant(), build("wang_young"), scenario).trail("beta")
 
 
+def test_plan_that_knows_no_reference_is_not_continued():
+    """Promise 2: the plan of reading "zero" leads away, so the input is held."""
+    controller = integral_of_error(MODEL, Horizon(10, 4), 1.0, 1.0, None, "zero")
+    noise = np.zeros(140)
+    noise[100:103] = np.nan
+    scenario = Scenario(steps(2.0, each=140), v=np.zeros(140), noise=noise)
+    run = closed_loop(MODEL, controller, scenario)
+    assert (run.status[100:103] == Status.HELD).all()
+    assert np.ptp(run.u[99:103]) == 0.0
+    assert run.y[99:, 0] == pytest.approx(2.0, abs=0.02)
+
+
+@pytest.mark.parametrize("reading", ["held", "zero"])
+@pytest.mark.parametrize("stops", [True, False])
+def test_sum_of_the_error_stops_at_a_level_limit(reading, stops):
+    """Promise 3: after a reference out of reach the input leaves its limit at once."""
+    lag = DifferenceModel([-0.9], [0.1])
+    limits = Limits(u=(-1.0, 1.0))
+    controller = integral_of_error(
+        lag, Horizon(12, 4), 0.1, 0.1, limits, reading, anti_windup=stops
+    )
+    run = closed_loop(lag, controller, Scenario(steps(3.0, 0.5, each=100)))
+    assert run.u[95:100] == pytest.approx(1.0)
+    left = run.u[102, 0] < 1.0 - DECISION
+    assert left == stops  # the thesis's sum keeps it there for the whole window
+    if stops:
+        assert run.y[-1, 0] == pytest.approx(0.5, abs=1e-3)
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [
@@ -597,7 +626,9 @@ def test_vectors_of_the_wrong_size_are_refused(call, message):
 
 def test_integral_of_error_alone_holds_its_sum(rng):
     """The sum of the error in the memory is the sum of the error of the run."""
-    controller = integral_of_error(MODEL, Horizon(6, 3), 1.0, 1.0, LIMITS)
+    controller = integral_of_error(
+        MODEL, Horizon(6, 3), 1.0, 1.0, LIMITS, anti_windup=False
+    )
     scenario = Scenario(steps(0.5), v=np.zeros(40), noise=rng.standard_normal(40))
     layout = controller.form.recipe.layout
     total = 0.0

@@ -169,9 +169,9 @@ def test_ifac93_corners(
     """Counts of the corners beyond both bands; level 1 has each plant twice."""
     found = chapters_4_5["ifac93_4_4_2"]["corners"][key][str(level)]
     case = cases.case("ifac93_4_4_2")
-    base = case.designs["integral_of_error"]
+    name = "integral_of_error" if structure == "integral_of_error" else "wang_young"
     controller = dataclasses.replace(
-        base, structure=structure, Q=Q, reference=reading
+        case.designs[name], structure=structure, Q=Q, reference=reading
     ).build()
     plants = [p.sampled(0.5, substeps=20) for p in cases.stress_corners(level)]
     times = len(plants) // found["n"]

@@ -27,7 +27,13 @@ def _siso_weights() -> Iterator[Claim]:
     reached = {}
     for reading in ("held", "next", "preview", "zero"):
         design = Design(
-            "integral_of_error", model, Horizon(10, 5), *printed, limits, reading
+            "integral_of_error",
+            model,
+            Horizon(10, 5),
+            *printed,
+            limits,
+            reading,
+            cases.AS_PRINTED,
         )
         reached[reading] = _first_step(design).t90
     yield claim(
@@ -48,6 +54,7 @@ def _siso_weights() -> Iterator[Claim]:
         printed[1],
         limits,
         "zero",
+        cases.AS_PRINTED,
     )
     first = _first_step(swapped)
     yield unchecked(
