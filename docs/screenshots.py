@@ -15,7 +15,7 @@ from pathlib import Path
 from playwright.sync_api import Page, sync_playwright
 
 HERE = Path(__file__).resolve().parent
-VIEWS = {"receding_horizon": ("", 24, True), "governor": ("", 34, False)}
+VIEWS = {"receding_horizon": ("?gain=20", 22, True), "governor": ("", 34, False)}
 """Page: choices in its address, sample shown, whether past plans are drawn."""
 
 

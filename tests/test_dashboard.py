@@ -528,7 +528,7 @@ def test_controls_have_names(visit: Open, path: str) -> None:
             for (const node of root.querySelectorAll("*")) {
               if (node.shadowRoot) look(node.shadowRoot)
               if (!/^(INPUT|SELECT|BUTTON)$/.test(node.tagName)) continue
-              const named = node.labels?.length || node.ariaLabel || node.innerText
+              const named = node.labels?.length || node.ariaLabel || node.textContent
               const id = node.getAttribute("aria-describedby")
               const helped = !id || root.getElementById(id)?.textContent
               if (!named || !helped) bad.push(node.outerHTML)

@@ -36,7 +36,6 @@ COLUMNS = {
     "settling": "Settling [{time}]",
     "overshoot": "Overshoot [%]",
     "IAE": "IAE",
-    "ISE": "ISE",
     "coupling": "Coupling",
     "RMS du": "RMS of du",
     "violations": "Limits broken",
@@ -256,7 +255,8 @@ def _measures(runs: Mapping[str, Run], channel: int) -> str:
         "outside them; the rest over the whole run"
     )
     return (
-        f"<table><caption>{caption}</caption><thead><tr><th>Run</th>{head}</tr></thead>"
+        f'<p class="quiet small">{caption}</p>'
+        f"<table><thead><tr><th>Run</th>{head}</tr></thead>"
         f"<tbody>{body}</tbody></table>"
     )
 
