@@ -14,7 +14,14 @@ from conftest import ROOT
 from scipy.optimize import least_squares as minimise
 from scipy.signal import lfilter
 
-from nmss_lab import DifferenceModel, Horizon, Scenario, closed_loop, wang_young
+from nmss_lab import (
+    DifferenceModel,
+    Horizon,
+    Scenario,
+    closed_loop,
+    reproduce,
+    wang_young,
+)
 from nmss_lab.cli import main
 from nmss_lab.files import load, save
 from nmss_lab.identify import (
@@ -37,6 +44,7 @@ from nmss_lab.identify import (
 )
 from nmss_lab.identify.fit import Work
 from nmss_lab.records import Record, shipped
+from nmss_lab.reproduce import chapter_2
 
 FOLDER = Path(__file__).parent / "golden"
 GOLDEN = json.loads((FOLDER / "identification.json").read_text(encoding="utf-8"))
@@ -154,6 +162,34 @@ def test_temperature_lab():
     assert_equal(estimate, GOLDEN["tclab_every_10th_113"], 1e-6)
     even = lab.resample(10.0).detrend("first", ["y"])
     assert sriv(even, Orders(1, (1,), (3,))).r2_t > 0.99
+
+
+@pytest.mark.parametrize(("mode", "late"), [("zoh", False), ("half", True)])
+def test_step_test_of_the_benchmark_plant(mode, late):
+    """What the half sample does to (4.23), as the rows of chapter 2 have it."""
+    record = chapter_2.step_tests()[late]
+    for orders in ("1 1 2", "1 1 3"):
+        known = GOLDEN["ifac93"][f"{mode} | step at k=10, N=210 | [{orders}]"]["p"]
+        na, nb, nk = map(int, orders.split())
+        estimate = sriv(record, Orders(na, (nb,), (nk,)))
+        assert estimate.parameters == pytest.approx(known, rel=1e-7)
+
+
+def test_verdicts_of_chapter_2():
+    """What comes out of the identified models and of the promises of 6.3.1."""
+    kinds = {row.name: row.kind for row in reproduce.claims(2)}
+    assert kinds["estimate, output read at the sample"] == "differs"
+    assert kinds["estimate, output read half a sample late"] == "reproduced after"
+    for row in (1, 2):
+        tabulated = f"coefficients of row {row}, dead times of Table 5.1"
+        shorter = f"coefficients of row {row}, dead times 8.54 s shorter"
+        assert kinds[tabulated] == "differs"
+        assert kinds[shorter] == kinds[f"gains of row {row}"] == "reproduced after"
+    assert kinds["SRIV is optimal, white noise"] == "reproduced"
+    assert kinds["SRIV is optimal, coloured noise"] == "differs"
+    assert kinds["N(p, P*), RIV, coloured noise"] == "reproduced"
+    assert kinds["N(p, P*), SRIV, coloured noise"] == "differs"
+    assert kinds["YIC avoids too many parameters"] == "reproduced"
 
 
 # --- The same minimum as prediction error -----------------------------------------

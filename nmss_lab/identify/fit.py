@@ -28,7 +28,7 @@ from nmss_lab.identify.structure import (
     Noise,
     Orders,
     Start,
-    delayed,
+    columns,
     input_names,
     inputs_of,
     is_stable,
@@ -41,7 +41,7 @@ CONVERGED = 1e-8
 """Change of the parameters at which the passes stop, as a share of the largest, each
 weighted by the size of what it multiplies."""
 
-FREE = 25
+FREE = 10
 """Bound on the passes of refined instrumental variables."""
 
 GUARDED = 150
@@ -108,7 +108,7 @@ def riv(
     work = Work.of(record, orders, start)
     begin, _, _ = work.settle(work.ordinary(), WHITE)
     p, passes, problem = work.settle(begin, noise)
-    c, d = fit_noise(work.residuals(p), noise)
+    c, d = work.noise_at(p, noise)
     return work.finish(p, "riv", passes, problem, c, d)
 
 
@@ -143,27 +143,35 @@ class Work:
         return self.orders.reach if self.start == "estimate" else 0
 
     @cached_property
-    def impulse(self) -> Array:
-        """Unit impulse at the first sample, through which the past acts."""
-        impulse = np.zeros(len(self.y))
-        impulse[0] = 1.0
-        return impulse
+    def base(self) -> Array:
+        """Output, inputs and, if the past is fitted, an impulse in its place: rows."""
+        rows = np.zeros((1 + self.inputs.shape[1] + bool(self.nuisance), len(self.y)))
+        rows[0], rows[1 : 1 + self.inputs.shape[1]] = self.y, self.inputs.T
+        if self.nuisance:
+            rows[-1, 0] = 1.0
+        return rows
 
     @cached_property
     def plain(self) -> Array:
         """Regressors of the equation as it is."""
-        return self.rows(self.y, self.inputs, self.impulse)
+        return self.rows(self.y, self.base[1:])
 
     @cached_property
     def size(self) -> Array:
         """Size of what each parameter multiplies: frees the passes from the units."""
         return _norms(self.plain)
 
-    def rows(self, y: Array, inputs: Array, impulse: Array) -> Array:
-        """Regressors (N - first, count + nuisance)."""
-        extra = [delayed(impulse, i) for i in range(self.nuisance)]
-        rows = self.orders.regressors(y, inputs)
-        return np.column_stack([rows, *extra])[self.first :]
+    def rows(self, y: Array, known: Array) -> Array:
+        """Regressors (N - first, count + nuisance) of an output and known signals."""
+        past = [(-y, i + 1) for i in range(self.orders.na)]
+        return columns(past + self.terms(known))[self.first :]
+
+    def terms(self, known: Array) -> list[tuple[Array, int]]:
+        """Known signals that the coefficients after A multiply, and their delays."""
+        inputs = known[: self.inputs.shape[1]]
+        return self.orders.of_inputs(inputs) + [
+            (known[-1], i) for i in range(self.nuisance)
+        ]
 
     def ordinary(self) -> Array:
         """Least squares on the equation."""
@@ -171,38 +179,39 @@ class Work:
         p, *_ = np.linalg.lstsq(scaled, self.y[self.first :], rcond=None)
         return p / self.size
 
-    def model(self, p: Array) -> tuple[Array, Array]:
-        """Reflected A and the output x of the model with it."""
-        A, B = self.orders.split(p)
-        A = stabilised(A)
-        x = np.zeros(len(self.y))
-        for b, u in zip(B, self.inputs.T, strict=True):
-            x += lfilter(b, A, u)
-        if self.nuisance:
-            x += lfilter(p[self.orders.count :], A, self.impulse)
-        return A, x
+    def denominator(self, p: Array) -> Array:
+        """Return A with its unstable roots reflected."""
+        return stabilised(np.concatenate([ONE, p[: self.orders.na]]))
+
+    def is_stable(self, p: Array) -> bool:
+        """Whether A is stable as it is."""
+        return is_stable(np.concatenate([ONE, p[: self.orders.na]]))
 
     def residuals(self, p: Array) -> Array:
         """Measured minus simulated output, (N - first,)."""
-        error: Array = (self.y - self.model(p)[1])[self.first :]
-        return error
+        known = np.asarray(lfilter(ONE, self.denominator(p), self.base[1:]))
+        error: Array = self.y - columns(self.terms(known)) @ p[self.orders.na :]
+        return error[self.first :]
 
     def filtered(self, p: Array, c: Array, d: Array) -> tuple[Array, Array, Array]:
-        """Instruments, regressors and output, filtered by C / (A D)."""
-        A, x = self.model(p)
-        signals = np.column_stack([self.y, x, self.inputs, self.impulse])
-        signals = np.asarray(lfilter(c, np.convolve(A, d), signals, axis=0))
-        y, x, inputs, impulse = np.split(signals, [1, 2, -1], axis=1)
-        Z, Phi = (self.rows(s[:, 0], inputs, impulse[:, 0]) for s in (x, y))
-        return Z, Phi, y[self.first :, 0]
+        """Instruments, regressors and output, filtered by C / (A D).
+
+        The output x of the model, which the instruments hold in place of y, is B u / A.
+        """
+        A = self.denominator(p)
+        signals = np.asarray(lfilter(ONE, A, self.base))
+        x = columns(self.terms(signals[1:])) @ p[self.orders.na :]
+        if len(c) + len(d) > 2:
+            signals = np.asarray(lfilter(c, d, signals))
+        x = np.asarray(lfilter(c, np.convolve(A, d), x))
+        Z, Phi = self.rows(x, signals[1:]), self.rows(signals[0], signals[1:])
+        return Z, Phi, signals[0, self.first :]
 
     def refine(self, p: Array, c: Array, d: Array) -> Array:
         """One pass of refined instrumental variables."""
         Z, Phi, y = self.filtered(p, c, d)
-        instruments = (Z / _norms(Z)).T
-        return np.linalg.solve(instruments @ (Phi / self.size), instruments @ y) / (
-            self.size
-        )
+        products = Z.T @ Phi / np.outer(self.size, self.size)
+        return np.linalg.solve(products, Z.T @ y / self.size) / self.size
 
     def descend(self, p: Array, c: Array, d: Array) -> Array:
         """One Gauss-Newton step, of a length that lowers the residuals of a stable A.
@@ -222,35 +231,43 @@ class Work:
         best = _lowest(now, -2.0 * float(step @ (Z.T @ e)), self.cost(p + step, c, d))
         for length in (best, *0.5 ** np.arange(HALVINGS)):
             new = p + length * step
-            stable = is_stable(self.orders.split(new)[0])
-            if stable and self.cost(new, c, d) <= now * (1.0 + 1e-12):
+            if self.is_stable(new) and self.cost(new, c, d) <= now * (1.0 + 1e-12):
                 return new
         raise np.linalg.LinAlgError("no step lowers the residuals")
 
     def cost(self, p: Array, c: Array, d: Array) -> float:
         """Sum of squares of the innovations."""
-        e = np.asarray(lfilter(c, d, self.residuals(p)))
+        e = self.residuals(p)
+        if len(c) + len(d) > 2:
+            e = np.asarray(lfilter(c, d, e))
         return float(e @ e)
+
+    def noise_at(self, p: Array, noise: Noise) -> tuple[Array, Array]:
+        """Noise model of the residuals."""
+        return fit_noise(self.residuals(p), noise) if noise != WHITE else (ONE, ONE)
 
     def settle(self, p: Array, noise: Noise) -> tuple[Array, int, str]:
         """Repeat passes until the parameters stand still at a stable model.
 
-        Passes that swing, diverge or end in an unstable model go on from there as
-        guarded steps.
+        Passes that swing, diverge or end in an unstable model go on as guarded steps,
+        from where they ended or from the beginning, whichever fits better.
 
         Returns
         -------
         parameters, number of passes, problem
         """
-        p, passes, problem = self.repeat(p, noise, self.refine, FREE, CONVERGED)
-        A, _ = self.orders.split(p)
-        if not problem and is_stable(A):
-            return p, passes, problem
-        p = np.concatenate([stabilised(A)[1:], p[self.orders.na :]])
-        p, more, problem = self.repeat(
-            p, noise, self.descend, GUARDED, GUARDED_CONVERGED
+        end, passes, problem = self.repeat(p, noise, self.refine, FREE, CONVERGED)
+        if not problem and self.is_stable(end):
+            return end, passes, problem
+        starts = [
+            np.concatenate([self.denominator(q)[1:], q[self.orders.na :]])
+            for q in (end, p)
+        ]
+        best = min(starts, key=lambda q: self.cost(q, *self.noise_at(q, noise)))
+        end, more, problem = self.repeat(
+            best, noise, self.descend, GUARDED, GUARDED_CONVERGED
         )
-        return p, passes + more, problem
+        return end, passes + more, problem
 
     def repeat(
         self,
@@ -264,7 +281,7 @@ class Work:
         change = np.inf
         for passes in range(1, bound + 1):
             try:
-                new = one_pass(p, *fit_noise(self.residuals(p), noise))
+                new = one_pass(p, *self.noise_at(p, noise))
             except np.linalg.LinAlgError:
                 return p, passes, "the instruments do not determine the parameters"
             if not np.isfinite(new).all():
@@ -283,8 +300,7 @@ class Work:
         self, p: Array, method: str, passes: int, problem: str, c: Array, d: Array
     ) -> Estimate:
         """Say what is wrong with the result and how certain it is."""
-        A, _ = self.orders.split(p)
-        if not is_stable(A):
+        if not self.is_stable(p):
             problem = "the model is unstable"
         Z, _, _ = self.filtered(p, c, d)
         e = np.asarray(lfilter(c, d, self.residuals(p)))
@@ -350,8 +366,8 @@ def _lowest(now: float, slope: float, there: float) -> float:
     return float(np.clip(-slope / (2.0 * bend), 0.1, 10.0)) if bend > 0.0 else 1.0
 
 
-def _norms(columns: Array) -> Array:
-    size = np.linalg.norm(columns, axis=0)
+def _norms(signals: Array) -> Array:
+    size = np.sqrt(np.einsum("ij,ij->j", signals, signals))
     return np.where(size > 0.0, size, 1.0)
 
 

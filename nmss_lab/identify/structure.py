@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -91,10 +92,16 @@ class Orders:
 
         What lies before the first sample counts as zero.
         """
-        past = [-delayed(y, i) for i in range(1, self.na + 1)]
-        for u, (k, n) in zip(inputs.T, self.delays, strict=True):
-            past += [delayed(u, k + i) for i in range(n)]
-        return np.column_stack(past)
+        terms = [(-y, i + 1) for i in range(self.na)]
+        return columns(terms + self.of_inputs(inputs.T))
+
+    def of_inputs(self, inputs: Array) -> list[tuple[Array, int]]:
+        """List what the coefficients of B_i multiply: inputs (n_u, N) and delays."""
+        return [
+            (u, k + i)
+            for u, (k, n) in zip(inputs, self.delays, strict=True)
+            for i in range(n)
+        ]
 
 
 @dataclass(frozen=True)
@@ -123,21 +130,40 @@ def delayed(signal: Array, samples: int) -> Array:
     return late
 
 
+def columns(terms: Sequence[tuple[Array, int]]) -> Array:
+    """Signals side by side, each with its own delay, zero before: (N, n)."""
+    samples = len(terms[0][0])
+    late = np.zeros((len(terms), samples))
+    for row, (signal, delay) in zip(late, terms, strict=True):
+        row[delay:] = signal[: max(samples - delay, 0)]
+    return late.T
+
+
 def stabilised(polynomial: Array) -> Array:
     """Monic polynomial in z^-1 with roots outside the unit circle reflected into it."""
+    if is_stable(polynomial):
+        return polynomial
     roots = np.roots(polynomial)
     size = np.abs(roots)
     outside = size >= 1.0
-    if not outside.any():
-        return polynomial
     short = np.minimum(1.0 / size[outside], 0.999)
     roots[outside] *= short / size[outside]
     return np.concatenate([ONE, np.real(np.poly(roots))[1:]])
 
 
 def is_stable(polynomial: Array) -> bool:
-    """Whether all roots of a monic polynomial in z^-1 lie inside the unit circle."""
-    return bool((np.abs(np.roots(polynomial)) < 1.0).all())
+    """Whether all roots of a monic polynomial in z^-1 lie inside the unit circle.
+
+    By the recursion of Schur and Cohn, which is faster than the roots.
+    """
+    a = polynomial.tolist()
+    while len(a) > 1:
+        k = a[-1]
+        if not abs(k) < 1.0:
+            return False
+        rest = 1.0 - k * k
+        a = [(x - k * y) / rest for x, y in zip(a[:-1], a[:0:-1], strict=True)]
+    return True
 
 
 def inputs_of(record: Record) -> Array:

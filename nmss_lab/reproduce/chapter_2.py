@@ -47,7 +47,7 @@ def responses(plant: LinearPlant, u: Array) -> Array:
 
 
 @functools.cache
-def _step_tests() -> tuple[Record, Record]:
+def step_tests() -> tuple[Record, Record]:
     """Step of the IFAC'93 plant every 0.5 s, read at once and half a sample late."""
     u = np.concatenate([np.zeros(10), np.ones(200)])
     y = responses(cases.ifac93_plant().sampled(0.5, substeps=2), u)
@@ -57,7 +57,7 @@ def _step_tests() -> tuple[Record, Record]:
 
 
 def _model_423() -> Iterator[Claim]:
-    at_once, late = _step_tests()
+    at_once, late = step_tests()
     orders = Orders(1, (1,), (2,))
     held, shifted = sriv(at_once, orders), sriv(late, orders)
     yield claim(
@@ -97,7 +97,7 @@ def _shifts(held: Estimate, shifted: Estimate) -> str:
 def _orders_423() -> Iterator[Claim]:
     for name, record, erratum in zip(
         ("at the sample", "half a sample late"),
-        _step_tests(),
+        step_tests(),
         ("", "E2.1"),
         strict=True,
     ):
