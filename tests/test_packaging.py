@@ -89,9 +89,13 @@ def borrowed() -> Iterator[str]:
 
 
 def test_wheel_carries_everything(wheel: Path) -> None:
-    """Modules, pages, type marker and licence are in the wheel, tests are not."""
+    """Modules, records with their licences, pages and the like are in the wheel."""
     names = set(zipfile.ZipFile(wheel).namelist())
-    modules = {f"nmss_lab/{path.name}" for path in ROOT.glob("nmss_lab/*.py")}
+    modules = {
+        path.relative_to(ROOT).as_posix()
+        for path in ROOT.glob("nmss_lab/**/*")
+        if path.is_file() and "__pycache__" not in path.parts
+    }
     pages = {
         f"nmss_lab/_pages/{path.relative_to(ROOT).as_posix()}"
         for path in ROOT.glob("apps/**/*")
