@@ -145,11 +145,10 @@ class PredictiveController(Controller):
         r = np.tile(self.form.recipe.layout.read(memory.vector, "r"), 1 + self.preview)
         free = self._free_move(memory.vector, r)
         low, high = self.limits_u
-        held = ((free > high) & np.isclose(u, high)) | (
+        held: Array = ((free > high) & np.isclose(u, high)) | (
             (free < low) & np.isclose(u, low)
         )
-        held = held.any(axis=-1, keepdims=True)
-        return np.where(held, u - free, missed)
+        return np.where(held.any(axis=-1, keepdims=True), u - free, missed)
 
     def _decide(self, memory: Memory, r: Array, v: Array) -> Move:
         theta = self._known(memory.vector, r, v)
