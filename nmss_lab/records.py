@@ -214,7 +214,7 @@ class Record:
             raise ValueError(
                 f"irregular sampling: the interval is {usual:g} but {steps[worst]:g} "
                 f"between rows {worst} and {worst + 1} (time {self.time[worst]:g}), "
-                f"a deviation of {deviation[worst]:g}"
+                f"a deviation of {deviation[worst]:g}; `resample` makes it regular"
             )
         return float(self.time[-1] - self.time[0]) / (self.time.size - 1)
 

@@ -187,24 +187,26 @@ def collect(
     if bad not in ("refuse", "skip"):
         raise ValueError(f'bad = {bad!r}: expected "refuse" or "skip"')
     places = {name: names.index(name) for name in wanted}
-    good, faults = _sorted_out(rows, places, time)
+    clock = Clock()
+    good, faults = _sorted_out(rows, places, time, clock)
     if faults and bad == "refuse":
         raise ValueError(_complaint(faults))
     if not good:
         raise ValueError("the file has no data below its header")
     columns = dict(zip(places, np.array(good).T, strict=True))
     units = {name: unit for name, unit in named if unit and name in places}
+    if clock.origin is not None:
+        units[str(time)] = "s"
     notes = (f"left out: {_complaint(faults)}",) if faults else ()
     return Table(columns, units, notes)
 
 
 def _sorted_out(
-    rows: Rows, places: dict[str, int], time: str | None
+    rows: Rows, places: dict[str, int], time: str | None, clock: Clock
 ) -> tuple[list[list[float]], list[BadCell]]:
     """Rows of numbers, and the first fault of each bad row."""
     good: list[list[float]] = []
     faults: list[BadCell] = []
-    clock = Clock()
     for number, row in rows:
         values: list[float] = []
         for name, place in places.items():

@@ -497,9 +497,16 @@ def test_an_unstable_plant_is_never_returned_as_good():
         (lambda: sriv(record_of(U[:, None] * [1, 2]), ORDERS), "2 outputs"),
         (lambda: sriv(record_of(U, np.zeros(N)), ORDERS), "input u1 is constant"),
         (lambda: sriv(record_of(U, np.ones(N)), ORDERS, "skip"), "u1 is constant"),
-        (lambda: sriv(record_of(U[:7], U[:7]), ORDERS), "7 samples are too few"),
+        (lambda: sriv(record_of(U[-7:], U[-7:]), ORDERS), "7 samples are too few"),
         (lambda: sriv(record_of(U), ORDERS, "later"), 'start = "later"'),
         (lambda: sriv(record_of(U, []), ORDERS), "no inputs"),
+        (lambda: sriv(record_of(np.ones(N)), ORDERS), "output y1 is constant"),
+        (lambda: sriv(record_of(U[-9:], U[-9:]), Orders(1, (1,), (9,))), "too few for"),
+        (lambda: riv(record_of(U[:40], U[:40]), ORDERS, Noise(11)), "40 samples are"),
+        (
+            lambda: sriv(Record(time=np.arange(N) ** 1.1, y=U, u=U), ORDERS),
+            "irregular sampling",
+        ),
         (lambda: Orders(0, (1,), (1,)), "must be at least 1"),
         (lambda: Orders(1, (1,), ()), "one entry an input"),
         (lambda: Noise(1, -1), "must not be negative"),
@@ -514,6 +521,22 @@ def test_impossible_requests_say_what_is_wrong(make, message):
     """Before any number is made."""
     with pytest.raises(ValueError, match=message):
         make()
+
+
+def test_what_a_record_does_not_determine_is_said():
+    """Inputs that move together, an input that hardly moves, a common factor."""
+    y = noisy(3).y
+    twice = Orders(2, (2, 2), (1, 1))
+    pulse = np.concatenate([np.zeros(N - 2), [1.0, 1.0]])
+    together = sriv(record_of(y, np.column_stack([U, 2 * U])), twice)
+    hardly = sriv(record_of(y, pulse), Orders(1, (3,), (1,)))
+    for estimate in (together, hardly):
+        assert "does not determine" in estimate.problem
+        assert estimate.standard_errors.max() > 1e3
+    fitted = least_squares(
+        record_of(lfilter([0, 1.0], [1, -1.1], U[:99]), U[:99]), Orders(1, (1,), (1,))
+    )
+    assert fitted.problem == "the model is unstable"
 
 
 def test_a_step_from_the_first_sample_on_is_no_constant():

@@ -209,7 +209,7 @@ def test_dates_with_a_zone_become_seconds():
     """An hour is an hour, across summer time and between zones."""
     record = Record.from_csv(io.StringIO(DATES), y=["y"], u=["u"], time="when")
     assert record.time.tolist() == [0.0, 3600.0, 7200.0]
-    assert record.units == {"y": "degC"}
+    assert record.units == {"y": "degC", "time": "s"}
     plain = DATES.replace("+01:00", "").replace("+02:00", "").replace("Z", "")
     with pytest.raises(ValueError, match=r"row 4.*does not come after the row before"):
         Record.from_csv(io.StringIO(plain), y=["y"], time="when")

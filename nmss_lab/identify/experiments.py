@@ -117,4 +117,4 @@ def expected_errors(
         np.asarray(lfilter(noise_c, by, x)),
         np.asarray(lfilter(noise_c, by, inputs, axis=0)),
     )
-    return noise * np.sqrt(np.diag(inverse_product(Z)))
+    return noise * np.sqrt(np.diag(inverse_product(Z)[0]))

@@ -54,6 +54,14 @@ HALVINGS = 40
 """How often a guarded step is halved."""
 
 
+SINGULAR = 1e-13
+"""Ratio of eigenvalues, all columns scaled, below which rounding decides."""
+
+UNDETERMINED = (
+    "the record does not determine the parameters: inputs move together or too "
+    "little, or the orders are too high"
+)
+
 WHITE = Noise(0)
 """White noise."""
 
@@ -71,7 +79,8 @@ def least_squares(record: Record, orders: Orders, start: Start = "rest") -> Esti
     Raises
     ------
     ValueError
-        If the record does not fit the orders, is too short, or an input is constant.
+        If the record does not fit the orders, is too short or irregularly sampled, or
+        a column is constant.
     """
     work = Work.of(record, orders, start)
     p = work.ordinary()
@@ -104,8 +113,15 @@ def riv(
     noise : Noise
         Fitted to the residuals in every pass, see ``fit_noise``.
     record, orders, start : see ``least_squares``
+
+    Raises
+    ------
+    ValueError
+        As ``least_squares``, or if the record is too short for the noise model.
     """
     work = Work.of(record, orders, start)
+    if len(record.y) < 4 * (noise.ar + noise.ma):
+        raise ValueError(f"{len(record.y)} samples are too few for {noise}")
     begin, _, _ = work.settle(work.ordinary(), WHITE)
     p, passes, problem = work.settle(begin, noise)
     c, d = work.noise_at(p, noise)
@@ -130,7 +146,7 @@ class Work:
         _check(record, orders, start)
         first = orders.reach if start == "skip" else 0
         unknown = orders.count + (orders.reach if start == "estimate" else 0)
-        if len(y) - first < 2 * unknown:
+        if len(y) - first < 2 * unknown or len(y) <= orders.reach:
             raise ValueError(
                 f"{len(y)} samples are too few for the {unknown} unknowns of {orders} "
                 f'with start = "{start}"'
@@ -299,9 +315,7 @@ class Work:
     def finish(
         self, p: Array, method: str, passes: int, problem: str, c: Array, d: Array
     ) -> Estimate:
-        """Say what is wrong with the result and how certain it is."""
-        if not self.is_stable(p):
-            problem = "the model is unstable"
+        """Instruments and innovations at the end of the passes."""
         Z, _, _ = self.filtered(p, c, d)
         e = np.asarray(lfilter(c, d, self.residuals(p)))
         return self.estimate(p, Z, e, method, passes, problem, c, d)
@@ -317,9 +331,16 @@ class Work:
         c: Array,
         d: Array,
     ) -> Estimate:
-        """Estimate with both covariances, without the nuisance coefficients."""
+        """Say how certain the result is and what is wrong with it.
+
+        Nuisance coefficients are left out after they have had their effect.
+        """
         n = self.orders.count
-        bread = inverse_product(Z)
+        bread, determined = inverse_product(Z)
+        if not determined:
+            problem = UNDETERMINED
+        if not self.is_stable(p):
+            problem = "the model is unstable"
         settled = e[max(len(c), len(d)) - 1 :]
         s2 = np.mean(settled**2) * len(e) / (len(e) - n)
         return Estimate(
@@ -339,6 +360,7 @@ class Work:
 
 
 def _check(record: Record, orders: Orders, start: Start) -> None:
+    _ = record.dt  # refuses irregular sampling
     if start not in get_args(Start):
         raise ValueError(f'start = "{start}": expected one of {get_args(Start)}')
     if record.y.shape[1] != 1:
@@ -346,6 +368,8 @@ def _check(record: Record, orders: Orders, start: Start) -> None:
             f"record has {record.y.shape[1]} outputs, expected one at a time: "
             "see Record.output"
         )
+    if np.ptp(record.y) == 0.0:
+        raise ValueError(f"output {record.names['y'][0]} is constant")
     inputs = inputs_of(record)
     if inputs.shape[1] != len(orders.nb):
         raise ValueError(
@@ -371,12 +395,16 @@ def _norms(signals: Array) -> Array:
     return np.where(size > 0.0, size, 1.0)
 
 
-def inverse_product(Z: Array) -> Array:
-    """Inverse of Z'Z; what Z does not determine gets a huge variance, never none."""
+def inverse_product(Z: Array) -> tuple[Array, bool]:
+    """Inverse of Z'Z, and whether Z determines all its columns' factors.
+
+    What it does not determine gets a huge variance, never none.
+    """
     size = _norms(Z)
     values, axes = np.linalg.eigh((Z / size).T @ (Z / size))
+    determined = bool(values.min() > SINGULAR * values.max())
     values = np.maximum(values, np.finfo(float).eps * values.max())
-    return (axes / values) @ axes.T / np.outer(size, size)
+    return (axes / values) @ axes.T / np.outer(size, size), determined
 
 
 def _weighted(Z: Array, e: Array) -> Array:
