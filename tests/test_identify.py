@@ -4,6 +4,7 @@ import json
 import pickle
 import re
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from dataclasses import replace
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
@@ -25,6 +26,7 @@ from nmss_lab import (
 from nmss_lab.cli import main
 from nmss_lab.files import load, save
 from nmss_lab.identify import (
+    Candidate,
     Noise,
     Orders,
     combine,
@@ -40,9 +42,12 @@ from nmss_lab.identify import (
     sriv,
     stabilised,
     staircase,
+    structures,
     table,
 )
-from nmss_lab.identify.fit import Work
+from nmss_lab.identify.fit import FREE, Work
+from nmss_lab.identify.noise import long_autoregression
+from nmss_lab.identify.search import _rank
 from nmss_lab.records import Record, shipped
 from nmss_lab.reproduce import chapter_2
 
@@ -335,6 +340,17 @@ def test_planned_errors_come_true():
     assert fixed == pytest.approx(GOLDEN["siso_white"]["cramer_rao"], rel=1e-9)
 
 
+def test_planned_errors_with_arma_noise():
+    """As the covariance that RIV reports with the same noise model."""
+    white = np.random.default_rng(6).standard_normal(N + 300)
+    xi = lfilter([1.0, 0.5], [1.0, -0.8], white)[300:]
+    estimate = riv(record_of(lfilter(B, A, U) + xi), ORDERS, Noise(1, 1))
+    planned = expected_errors(
+        ORDERS, TRUE, U, 1.0, noise_c=np.array([1, -0.8]), noise_d=np.array([1, 0.5])
+    )
+    assert planned == pytest.approx(estimate.standard_errors, rel=0.2)
+
+
 def test_planned_errors_of_a_plant_on_the_unit_circle():
     """No reflection meddles with a marginally stable plant that is given."""
     marginal = GOLDEN["marginal"]
@@ -480,6 +496,18 @@ def test_every_structure_settles(noise):
     assert all(np.abs(c.estimate.poles()).max() < 1.0 for c in found)
 
 
+def test_guarded_steps_never_end_worse_than_they_began():
+    """They start from the better of two models and only go down."""
+    white = np.ones(1)
+    for orders in structures(1, [1, 2, 3], [1, 2, 3], [1, 3, 5]):
+        work = Work.of(gas_furnace(), orders, "rest")
+        begin = work.ordinary()
+        end, passes, _ = work.settle(begin, Noise(0))
+        if passes > FREE:
+            least = work.cost(begin, white, white)
+            assert work.cost(end, white, white) <= least * (1.0 + 1e-9)
+
+
 def test_an_unstable_plant_is_never_returned_as_good():
     """Growing data may give a model; it must not count as trustworthy."""
     unstable = lfilter([0, 1.0], [1, -1.05], U[:150])
@@ -561,6 +589,15 @@ def test_noise_models_are_found():
     assert c == pytest.approx([1, -0.8], abs=4 * 0.005)
     assert d == pytest.approx([1, 0.5], abs=4 * 0.0075)
     assert fit_noise(white, Noise(0))[0].tolist() == [1.0]
+
+
+def test_residuals_choose_the_order_of_their_autoregression():
+    """None for white noise, two for a resonance."""
+    white = np.random.default_rng(4).standard_normal((20, N))
+    orders = [len(long_autoregression(e)) - 1 for e in white]
+    assert orders.count(0) >= 18
+    resonant = [lfilter([1.0], [1, -1.5, 0.8], e) for e in white]
+    assert [len(long_autoregression(e)) - 1 for e in resonant].count(2) >= 16
 
 
 def test_moving_average_noise_is_at_its_minimum():
@@ -670,6 +707,23 @@ def test_delay_with_its_uncertainty():
     assert vague[2] > 0.05
 
 
+def test_probabilities_of_delays_follow_from_the_likelihood():
+    """Two structures of as many parameters compare by N ln(variance) / 2."""
+    estimate = sriv(noisy(7), Orders(1, (2,), (1,)))
+    profile = delay_profile(estimate, [2, 3])
+    sizes = [sriv(noisy(7), Orders(1, (2,), (k,))).variance for k in (2, 3)]
+    expected = (sizes[1] / sizes[0]) ** (N / 2)
+    assert profile[2] / profile[3] == pytest.approx(expected, rel=1e-3)
+
+
+def test_criteria_count_all_parameters():
+    """AIC and BIC by their definitions, with those of the noise model."""
+    estimate = riv(noisy(7, coloured=True), ORDERS, Noise(1))
+    size = N * np.log(np.mean(estimate.innovations**2))
+    assert estimate.aic == pytest.approx(size + 2 * 5)
+    assert estimate.bic == pytest.approx(size + np.log(N) * 5)
+
+
 def test_delay_of_one_input_of_several():
     """The other keeps its delay; the noise model is that of the estimate."""
     estimate = riv(two_inputs(4, 0.3), MISO, Noise(1))
@@ -707,6 +761,17 @@ def test_search_finds_the_true_orders():
     assert min(found, key=lambda c: c.row["bic"]).orders == Orders(2, (2,), (2,))
     good = [c.estimate.yic for c in found if not c.problem]
     assert all(a <= b for a, b in pairwise(good))
+
+
+def test_what_is_not_to_be_trusted_comes_last():
+    """However good its criterion looks, and whatever failed after that."""
+    estimate = sriv(noisy(1), ORDERS)
+    good = Candidate(ORDERS, estimate, "")
+    doubtful = replace(estimate, problem="swings", covariance=estimate.covariance / 9)
+    poor = Candidate(ORDERS, doubtful, doubtful.problem)
+    failed = Candidate(ORDERS, None, "too short")
+    assert doubtful.yic < estimate.yic
+    assert sorted([failed, poor, good], key=_rank) == [good, poor, failed]
 
 
 def test_search_table():
