@@ -381,7 +381,7 @@ def _dead_time(controller: PredictiveController) -> Finding:
     late = [
         f"{name} ({int(wait)} samples)"
         for name, wait in zip(controller.model.y_names, dead, strict=True)
-        if wait >= controller.horizon.Np
+        if wait > controller.horizon.Np
     ]
     if late:
         sentence = (
