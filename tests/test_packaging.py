@@ -114,7 +114,7 @@ def test_wheel_metadata(wheel: Path) -> None:
     assert said["Name"] == "nmss-lab"
     assert said["Version"] == nmss_lab.__version__
     assert said["Requires-Python"] == ">=3.11"
-    assert said["License-Expression"] == "BSD-3-Clause"
+    assert said["License-Expression"] == "BSD-3-Clause AND MIT AND CC-BY-SA-4.0"
 
 
 def test_import_away_from_checkout(installed: Path, tmp_path: Path) -> None:
