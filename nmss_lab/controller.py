@@ -141,7 +141,7 @@ _SENTENCES = {
     Status.SOFTENED: "Output limits could not all be kept: they were relaxed.",
     Status.DROPPED: "Output limits could not be kept: they were dropped this sample.",
     Status.CLIPPED: "The law asked for more than the input can do: it was clipped.",
-    Status.REFUSED: "A measurement was not a number: the last plan was continued.",
+    Status.REFUSED: "A measurement was not a number: its prediction stood in for it.",
     Status.SHIFTED: "The solver failed: the last plan was continued and clipped.",
     Status.HELD: "There was no plan worth continuing: the last input was held.",
 }
@@ -334,9 +334,8 @@ class Controller(ABC):
     ) -> Memory:
         """Take in the measurements y_k (..., n_y), r_k (..., n_y) and v_k (..., n_v).
 
-        An entry of y or v that is not finite never enters: the model's prediction, or
-        the last v, takes its place, the sum of the error stands still, and ``decide``
-        continues the last plan.
+        An entry of y or v that is not finite never enters: the model's prediction of
+        it, or the last v, takes its place, and the next move says so.
 
         Raises
         ------
@@ -350,9 +349,8 @@ class Controller(ABC):
             raise ValueError(f"r = {r} is not finite")
         v = layout.read(before, "v")[..., 0, :] if v is None else v
         v = _channels("v", v, model.n_v)
-        numbers = np.isfinite(y).all(axis=-1) & np.isfinite(v).all(axis=-1)
-        good = np.asarray(numbers)
-        if not good.all():
+        good = np.isfinite(y).all(axis=-1) & np.isfinite(v).all(axis=-1)
+        if not np.all(good):
             y = np.where(np.isfinite(y), y, before @ recipe.forecast.T)
             v = np.where(np.isfinite(v), v, layout.read(before, "v")[..., 0, :])
         r = np.broadcast_to(r, y.shape)
@@ -360,11 +358,7 @@ class Controller(ABC):
             [y, np.broadcast_to(v, (*y.shape[:-1], v.shape[-1])), r], -1
         )
         vector = before @ recipe.carry.T + now @ recipe.enter.T
-        if "integral" in layout and not good.all():
-            kept = before[..., layout["integral"]]
-            part = vector[..., layout["integral"]]
-            vector[..., layout["integral"]] = np.where(good[..., None], part, kept)
-        return dataclasses.replace(memory, vector=vector, refused=~good)
+        return dataclasses.replace(memory, vector=vector, refused=~np.asarray(good))
 
     def decide(
         self, memory: Memory, r: Array | None = None, v: Array | None = None
@@ -397,6 +391,8 @@ class Controller(ABC):
         r_all = _ahead("r", r, r_now, 1 + self.preview)
         v_all = _ahead("v", v, v_now, 1 + self.forecast_steps)
         move = self._decide(many, r_all, v_all)
+        told = np.where(many.refused, Status.REFUSED, Status.FREE)
+        np.maximum(move.status, told, out=move.status)
         return Move(*(part[0] for part in _parts(move))) if single else move
 
     def apply(
@@ -429,12 +425,7 @@ class Controller(ABC):
         if "integral" in layout:
             vector = self._tracked(vector, self._missed(memory, u, move))
         applied = np.concatenate([u, seen, move.governed], axis=-1)
-        sums = vector[..., layout["integral"]] if "w" in layout else None
         vector = vector @ recipe.keep.T + applied @ recipe.store.T
-        if sums is not None:  # w waits where y was refused
-            part = vector[..., layout["integral"]]
-            refused = memory.refused[..., None]
-            vector[..., layout["integral"]] = np.where(refused, sums, part)
         return Memory(
             vector,
             move.decision,

@@ -65,7 +65,8 @@ class ReferenceGovernor(PredictiveController):
         x = memory.vector @ self.form.recipe.state.T
         if self.causal:
             x = x + move.governed @ self.form.D.T
-        return np.where(memory.refused[..., None], 0.0, u + x @ self.K.T)
+        missed: Array = u + x @ self.K.T
+        return missed
 
     def _decide(self, memory: Memory, r: Array, v: Array) -> Move:
         if self.causal:
@@ -73,7 +74,6 @@ class ReferenceGovernor(PredictiveController):
         # No decision moves u_k: plan from the input that the actuator will allow.
         asked = -memory.vector @ self.form.recipe.state.T @ self.K.T
         missed = self.clip(asked, self.last_input(memory.vector)) - asked
-        missed[memory.refused] = 0.0
         vector = self._tracked(memory.vector, missed)
         move = super()._decide(replace(memory, vector=vector), r, v)
         cut = np.abs(missed).max(axis=-1) > 1e-6

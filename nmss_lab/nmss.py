@@ -410,7 +410,7 @@ def _layout(model: DifferenceModel, internal: bool = False, **more: int) -> Layo
     """Memory of the histories that every structure keeps, and ``more`` parts."""
     shapes: dict[str, int | tuple[int, ...]] = {
         "y": (model.na + 1, model.n_y),
-        "u": (model.nb, model.n_u),
+        "u": (model.nb + 1, model.n_u),
         "v": (model.ng + 1, model.n_v),
         "r": model.n_y,
     }
@@ -433,7 +433,7 @@ def _recipe(
     _push(layout, "v", carry, enter, slice(p, p + r))
     _push(layout, "r", carry, enter, slice(p + r, None))
     _push(layout, "u", keep, store, slice(0, q))
-    forecast = _one_step(model, layout, "y", "u")
+    forecast = _one_step_of_changes(model, layout)
     if "integral" in layout:
         enter[layout["integral"], :p] = -np.eye(p)
         if governed:
@@ -470,6 +470,14 @@ def _one_step(model: DifferenceModel, layout: Layout, y: str, u: str) -> Array:
         stacked = _side_by_side(coefficients)
         row[:, start : start + stacked.shape[1]] = stacked
     return row
+
+
+def _one_step_of_changes(model: DifferenceModel, layout: Layout) -> Array:
+    """y_{k-1} and the change that (4.1) predicts: right under any constant load."""
+    change = -_side_by_side(model.a) @ _changes(layout, "y", model.na)
+    change += _side_by_side(model.b) @ _changes(layout, "u", model.nb)
+    change += _side_by_side(model.g) @ _changes(layout, "v", model.ng)
+    return _rows(layout, "y", 1) + change
 
 
 def _rows(layout: Layout, name: str, count: int) -> Array:

@@ -44,7 +44,7 @@ class StateFeedback(Controller):
     def _decide(self, memory: Memory, r: Array, v: Array) -> Move:
         on_memory, _ = self.free_law()
         before = self.last_input(memory.vector)
-        wanted = np.where(memory.refused[:, None], before, memory.vector @ on_memory.T)
+        wanted = memory.vector @ on_memory.T
         u = self.clip(wanted, before)
         loops = len(u)
         cut = np.abs(u - wanted).max(axis=-1) > 1e-9
@@ -55,7 +55,7 @@ class StateFeedback(Controller):
             governed=r[:, 0].copy(),
             decision=np.zeros((loops, 0)),
             known=np.zeros((loops, 0)),
-            status=np.where(memory.refused, Status.HELD, status),
+            status=status,
             cost=np.zeros(loops),
             multipliers=np.zeros((loops, 0)),
             iterations=np.zeros(loops, dtype=int),

@@ -167,7 +167,7 @@ class PredictiveController(Controller):
             iterations=np.zeros(loops, dtype=int),
             shift=np.zeros(loops, dtype=int),
         )
-        for i in np.flatnonzero(~kept | memory.refused).tolist():
+        for i in np.flatnonzero(~kept).tolist():
             self._decide_limited(move, memory, i)
         return self._finish(move, memory)
 
@@ -199,11 +199,8 @@ class PredictiveController(Controller):
         return np.concatenate([latest[:, :1], ahead], axis=1)
 
     def _decide_limited(self, move: Move, memory: Memory, i: int) -> None:
-        """Fill in row i, where the free optimum breaks a limit or cannot be had."""
+        """Fill in row i, where the free optimum breaks a limit."""
         before = self.last_input(memory.vector[i])
-        if memory.refused[i]:
-            self._continue(move, memory, i, before, Status.REFUSED)
-            return
         guess = memory.decision[i], memory.multipliers[i]
         solution, status = self._solve(
             move.known[i],
@@ -212,7 +209,7 @@ class PredictiveController(Controller):
         )
         if not solution.found:
             LOG.warning("%s %s", solution.status.value, solution.message)
-            self._continue(move, memory, i, before, Status.SHIFTED)
+            self._continue(move, memory, i, before)
             return
         move.decision[i] = solution.decision
         move.u[i] = self.first_move.value(solution.decision, move.known[i])
@@ -220,9 +217,7 @@ class PredictiveController(Controller):
         move.multipliers[i] = solution.multipliers
         move.iterations[i] = solution.iterations
 
-    def _continue(
-        self, move: Move, memory: Memory, i: int, before: Array, status: Status
-    ) -> None:
+    def _continue(self, move: Move, memory: Memory, i: int, before: Array) -> None:
         """Fall back on the last plan, or hold the input where there is none.
 
         A plan that knows no reference (reading "zero") leads away from it: better hold.
@@ -233,7 +228,7 @@ class PredictiveController(Controller):
             move.u[i], move.status[i], move.shift[i] = before, Status.HELD, -1
             return
         move.decision[i], move.known[i] = memory.decision[i], memory.known[i]
-        move.shift[i], move.status[i] = memory.shift[i] + 1, status
+        move.shift[i], move.status[i] = memory.shift[i] + 1, Status.SHIFTED
         step = min(int(move.shift[i]), self.horizon.Np - 1)
         u = self.signals["u"].value(move.decision[i], move.known[i])
         move.u[i] = u.reshape(self.horizon.Np, -1)[step]

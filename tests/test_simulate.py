@@ -229,30 +229,34 @@ def test_priority_breaks_the_less_important_no_more_than_needed():
 
 @pytest.mark.parametrize("name", ALL)
 def test_measurement_that_is_not_a_number_is_refused(name):
-    """Promise 2: it never enters; the loop is back in place soon after."""
+    """Promise 2: it never enters; its prediction stands in, also under a load."""
     noise = np.zeros(140)
     noise[[60, 61, 62]] = np.nan
     noise[100] = np.inf
-    scenario = Scenario(steps(2.0, each=140), v=np.zeros(140), noise=noise)
+    scenario = Scenario(
+        steps(2.0, each=140),
+        v=np.zeros(140),
+        noise=noise,
+        output_disturbance=0.3 * (np.arange(140) > 3),
+    )
     run = closed_loop(MODEL.plant(), build(name, LIMITS), scenario)
-    told = run.status[[60, 61, 62, 100]]
-    assert np.isin(told, [Status.REFUSED, Status.HELD]).all()
+    assert (run.status[[60, 61, 62, 100]] == Status.REFUSED).all()
+    assert (run.status != Status.REFUSED).sum() == 136
     check_inputs(run, LIMITS, name)
-    # at rest, a gap in the measurement is no reason to move
+    # with an exact model the prediction is the measurement: nothing changes
     clean = closed_loop(
         MODEL.plant(), build(name, LIMITS), dataclasses.replace(scenario, noise=None)
     )
-    assert np.abs(run.y - clean.y).max() < 0.02, name
-    assert run.y[-1, 0] == pytest.approx(2.0, abs=0.01)
+    assert np.abs(run.y - clean.y).max() < DECISION, name
 
 
 @pytest.mark.parametrize("name", ALL)
 def test_gap_during_a_step_does_not_spoil_the_loop(name):
-    """Promise 2: refused from the very first sample, and in the transient."""
+    """Promise 2: from the very first sample, in the transient, and on another plant."""
     noise = np.zeros(150)
     noise[[0, 1, 5, 6, 7]] = np.nan
     scenario = Scenario(steps(1.0, each=150), v=np.zeros(150), noise=noise)
-    run = closed_loop(MODEL.plant(), build(name, LIMITS), scenario)
+    run = closed_loop(MODEL.varied(1.05, 0.99), build(name, LIMITS), scenario)
     check_inputs(run, LIMITS, name)
     assert run.y[-1, 0] == pytest.approx(1.0, abs=0.01)
 
@@ -266,7 +270,7 @@ def test_disturbance_that_is_not_a_number_is_refused(name):
     memory = controller.apply(memory, [0.1], controller.decide(memory))
     memory = controller.measure(memory, [0.6], [1.0], [np.nan])
     move = controller.decide(memory)
-    assert move.status in (Status.REFUSED, Status.HELD)
+    assert move.status == Status.REFUSED
     assert np.isfinite(memory.vector).all()
     assert controller.form.recipe.layout.read(memory.vector, "v")[0] == [2.0]
 
@@ -575,16 +579,17 @@ def test_trail_of_a_controller_without_predictions_is_refused():
         closed_loop(MODEL.plant(), build("wang_young"), scenario).trail("beta")
 
 
-def test_plan_that_knows_no_reference_is_not_continued():
+def test_plan_that_knows_no_reference_is_not_continued(broken):
     """Promise 2: the plan of reading "zero" leads away, so the input is held."""
-    controller = integral_of_error(MODEL, Horizon(10, 4), 1.0, 1.0, None, "zero")
-    noise = np.zeros(140)
-    noise[100:103] = np.nan
-    scenario = Scenario(steps(2.0, each=140), v=np.zeros(140), noise=noise)
+    controller = integral_of_error(
+        MODEL, Horizon(10, 4), 1.0, 1.0, Limits(u=(-1, 1)), "zero", backend="broken"
+    )
+    scenario = Scenario(steps(5.0, each=60), v=np.zeros(60))
+    broken["now"] = False
     run = closed_loop(MODEL, controller, scenario)
-    assert (run.status[100:103] == Status.HELD).all()
-    assert np.ptp(run.u[99:103]) == 0.0
-    assert run.y[99:, 0] == pytest.approx(2.0, abs=0.02)
+    first = np.flatnonzero(run.status)[0]
+    assert (run.status[first:] == Status.HELD).all()
+    assert np.ptp(run.u[max(first - 1, 0) :]) == 0.0
 
 
 @pytest.mark.parametrize("reading", ["held", "zero"])
