@@ -285,11 +285,13 @@ def test_matlab_files(tmp_path):
     [("a.xlsx", "read_excel", 3), ("a.parquet", "read_parquet", 1)],
 )
 def test_tables_through_pandas(name, reader, row, tmp_path, monkeypatch):
-    """Spreadsheet rows count from the header; a missing library is named."""
-    frame = pandas.DataFrame({"y [K]": [1.0, 2.0], "u": [3.0, "x"]})
-    monkeypatch.setattr(pandas, reader, lambda path: frame)
+    """Real files; spreadsheet rows count from the header; no library, a clear word."""
+    frame = pandas.DataFrame({"y [K]": [1.0, 2.0], "u": ["3.0", "x"]})
+    written = {"read_excel": {"index": False}, "read_parquet": {}}[reader]
+    getattr(frame, reader.replace("read", "to"))(tmp_path / name, **written)
     record = Record.from_file(tmp_path / name, y=["y"], dt=1.0)
     assert record.units == {"y": "K"}
+    assert record.y.ravel().tolist() == [1.0, 2.0]
     with pytest.raises(ValueError, match=f"row {row}, column 'u': 'x'"):
         Record.from_file(tmp_path / name, y=["y"], u=["u"], dt=1.0)
 
