@@ -974,6 +974,80 @@ def wood_berry() -> Case:
     )
 
 
+# Identified models
+
+
+def model_case(
+    model: DifferenceModel, covariance: Array | None = None, name: str = "your_model"
+) -> Case:
+    """Case that tries controllers on a model of one's own, as on a perfect plant.
+
+    Horizons and weights follow from the model's slowest pole, its delay and its gains.
+
+    Parameters
+    ----------
+    model : DifferenceModel
+        Stable, with one output.
+    covariance : array, optional
+        Of its parameters.
+    name : str
+
+    Raises
+    ------
+    ValueError
+        If the model has several outputs, is not stable, or no input has a gain.
+    """
+    slowest = float(np.abs(model.poles()).max())
+    gains = np.abs(model.steady_state_gain()).ravel()
+    if model.n_y > 1 or slowest >= 1.0 or not gains.max() > 0.0:
+        raise ValueError(
+            f"model with {model.n_y} outputs, largest pole {slowest:.4g} and gains "
+            f"{gains}: expected one output, a stable model and a gain"
+        )
+    tau = float(np.clip(-1.0 / np.log(max(slowest, 0.1)), 1.0, 25.0))
+    Np = int(np.clip(model.nb + 3.0 * tau, 8, 80))
+    R = np.diag(0.1 * tau * np.maximum(gains, 1e-3 * gains.max()) ** 2)
+    design = Design("wang_young", model, Horizon(Np, int(np.clip(Np // 4, 2, 10))), R=R)
+    names = ["wang_young", *(["disturbance_direct"] * bool(model.n_v)), "minimal"]
+    integral = dataclasses.replace(
+        design,
+        structure="integral_of_error",
+        Q=state_weight(model, 1.0 / model.na, 0.0, 1.0 / tau**2),
+        reference="zero",
+    )
+    return Case(
+        name=name,
+        title="Your model",
+        section="",
+        source="Identified from a record",
+        plant=model.plant(),
+        designs={**predictive(design, *names), "integral_of_error": integral},
+        scenario=_trial(model, Np, gains),
+        notes=(
+            "The plant is the model itself; change its gain or dynamics to see what "
+            "an error of the model does.",
+            "Signals are deviations from what was taken away before the fit.",
+            f"Horizons, weights and scenario are defaults from the slowest pole "
+            f"({slowest:.4g}), the delay and the gains.",
+        ),
+        covariance=covariance,
+    )
+
+
+def _trial(model: DifferenceModel, Np: int, gains: Array) -> Scenario:
+    """Step of the reference, then of what acts at the input, then of what is seen."""
+    first, samples = 5, 5 + 4 * Np
+    change = np.zeros(model.n_u)
+    change[gains.argmax()] = 0.5 / gains.max()
+    at = first + 3 * Np // 2
+    seen = piecewise(samples, (first + 3 * Np, np.ones(model.n_v)))
+    return Scenario(
+        piecewise(samples, (first, 1.0)),
+        v=seen if model.n_v else None,
+        input_disturbance=piecewise(samples, (at, change)),
+    )
+
+
 CASES: dict[str, Callable[[], Case]] = {
     "governor_3_4": governor_3_4,
     "double_integrator_4_4_1": double_integrator_4_4_1,

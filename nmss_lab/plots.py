@@ -31,8 +31,10 @@ from bokeh.models import (
 from bokeh.plotting import figure
 
 from nmss_lab.controller import Status
+from nmss_lab.identify import Estimate, pole_draws, step_band, step_response
 from nmss_lab.models import Array
 from nmss_lab.predictive import PredictiveController
+from nmss_lab.records import Record
 from nmss_lab.simulate import Run
 
 STYLES = (
@@ -74,6 +76,10 @@ class Curve:
         Samples from the present one to the first predicted one.
     present : array (N,), optional
         Values at the samples, from which a trail that starts later sets out.
+    low, high : arrays (M,), optional
+        Band of uncertainty about the values.
+    marks : int
+        More than 0: drawn as points, this many of the first ones large.
     """
 
     label: str
@@ -84,6 +90,16 @@ class Curve:
     trail: Array | None = None
     ahead: int = 0
     present: Array | None = None
+    low: Array | None = None
+    high: Array | None = None
+    marks: int = 0
+
+    @property
+    def reach(self) -> Array:
+        """All finite values that it shows, its band included."""
+        parts = [p for p in (self.values, self.low, self.high) if p is not None]
+        shown = np.concatenate(parts)
+        return shown[np.isfinite(shown)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,6 +123,8 @@ class Chart:
         Unit of all times.
     counts : bool
         Whether values are whole numbers.
+    across : str
+        What lies on the horizontal axis.
     """
 
     name: str
@@ -118,6 +136,7 @@ class Chart:
     samples: Array = dataclasses.field(default_factory=lambda: np.arange(2.0))
     unit: str = "s"
     counts: bool = False
+    across: str = "time"
 
     @property
     def span(self) -> tuple[float, float]:
@@ -131,7 +150,9 @@ class Chart:
         Limits are included unless they are so far away that they would flatten the
         curves.
         """
-        values = np.concatenate([c.values for c in (*self.curves, *self.references)])
+        curves = (*self.curves, *self.references)
+        values = np.concatenate([np.zeros(0), *(c.reach for c in curves)])
+        values = values if values.size else np.zeros(1)
         low, high = float(values.min()), float(values.max())
         if self.counts:
             low, high = 0.0, max(high, 1.0)
@@ -232,6 +253,218 @@ def governor_charts(
         (Curve("zero", t, np.zeros(len(t)), held=True),),
     )
     return [*plain, *(_timed(chart, governed) for chart in (reference, beta))]
+
+
+# Estimates
+
+DRAWS = 200
+"""Models drawn from the covariance for bands and clouds."""
+
+LAGS = 25
+
+
+def record_charts(
+    record: Record,
+    estimates: Mapping[str, Estimate] | None = None,
+    checked: Record | None = None,
+) -> list[Chart]:
+    """Charts of a record with one output: measured and simulated output, inputs.
+
+    Parameters
+    ----------
+    record : Record
+    estimates : mapping of str to Estimate, optional
+        Up to three, by name; simulated over the record each was fitted to.
+    checked : Record, optional
+        Part for validation, simulated as well, its past fitted to it.
+
+    Returns
+    -------
+    list of Chart
+        Named "output" and "signal".
+
+    Raises
+    ------
+    ValueError
+        If there are too many estimates.
+    """
+    estimates = estimates or {}
+    _check_estimates(estimates)
+    thin = slice(None, None, max(1, len(record.time) // DRAWN_POINTS))
+    t, y = record.time[thin], record.y[thin, 0]
+    name = record.names["y"][0]
+    inputs = np.hstack([record.u, record.v])[thin, : len(STYLES)].T
+    names = (*record.names["u"], *record.names["v"])[: len(STYLES)]
+    output = Chart(
+        "output",
+        "Output, measured and simulated",
+        f"{name}{_unit(record.units.get(name, ''))}",
+        tuple(
+            Curve(label, *_simulated(found, checked), style=style)
+            for style, (label, found) in enumerate(estimates.items())
+        ),
+        (Curve("measured", t, y),),
+    )
+    units = {record.units.get(name, "") for name in names}
+    unit = units.pop() if len(units) == 1 else ""
+    curves = tuple(
+        Curve(label, t, u, True, style)
+        for style, (label, u) in enumerate(zip(names, inputs, strict=True))
+    )
+    axis = f"{', '.join(names)}{_unit(unit)}"
+    signal = Chart("signal", "Inputs and measured disturbances", axis, curves)
+    return [
+        dataclasses.replace(chart, samples=record.time[[0, -1]])
+        for chart in (output, signal)
+    ]
+
+
+def _simulated(found: Estimate, checked: Record | None) -> tuple[Array, Array]:
+    """Give times and values of the simulated output, a gap between the parts."""
+    t, x = found.record.time, found.simulated
+    if checked is not None:
+        beyond = found.explained(checked, "estimate")
+        t = np.concatenate([t, [np.nan], checked.time])
+        x = np.concatenate([x, [np.nan], beyond])
+    every = max(1, len(t) // (2 * DRAWN_POINTS))
+    return t[::every], x[::every]
+
+
+def estimate_charts(
+    estimates: Mapping[str, Estimate], channel: int = 0, seed: int = 0
+) -> list[Chart]:
+    """Charts of estimates side by side: step response, poles, correlations.
+
+    Parameters
+    ----------
+    estimates : mapping of str to Estimate
+        Up to three, by name.
+    channel : int
+        Input whose step and whose correlation with the residuals are shown.
+    seed : int
+        Of the draws from each covariance, for bands and clouds.
+
+    Returns
+    -------
+    list of Chart
+        Named "step", "poles", "auto" and "cross".
+
+    Raises
+    ------
+    ValueError
+        If there are too many estimates.
+    """
+    _check_estimates(estimates)
+    return [
+        _step_chart(estimates, channel, seed),
+        _pole_chart(estimates, seed),
+        _correlation_chart(
+            "auto",
+            "Autocorrelation of the residuals",
+            {name: found.autocorrelation(LAGS) for name, found in estimates.items()},
+        ),
+        _correlation_chart(
+            "cross",
+            "Residuals against past inputs",
+            {
+                name: (pair[0][:, channel], pair[1])
+                for name, found in estimates.items()
+                for pair in [found.cross_correlation(LAGS)]
+            },
+        ),
+    ]
+
+
+def _check_estimates(estimates: Mapping[str, Estimate]) -> None:
+    if len(estimates) > len(STYLES):
+        raise ValueError(f"{len(estimates)} estimates: expected up to {len(STYLES)}")
+
+
+def _step_chart(estimates: Mapping[str, Estimate], channel: int, seed: int) -> Chart:
+    samples = max((_settled(found) for found in estimates.values()), default=2)
+    curves = []
+    t: Array = np.zeros(0)
+    for style, (name, found) in enumerate(estimates.items()):
+        t = found.record.dt * np.arange(samples)
+        rng = np.random.default_rng(seed)
+        low, high = step_band(found, samples, rng, channel, DRAWS)
+        y = step_response(found, samples, channel)
+        curves.append(Curve(name, t, y, style=style, low=low, high=high))
+    ends = t[[0, -1]] if t.size else np.array([0.0, 1.0])
+    units = {
+        f"{name}{_unit(e.record.units.get(name, ''))}"
+        for e in estimates.values()
+        for name in e.record.names["y"]
+    }
+    axis = units.pop() if len(units) == 1 else "y [-]"
+    title = "Response to a unit step, with 95 % band"
+    return Chart("step", title, axis, tuple(curves), samples=ends)
+
+
+def _settled(found: Estimate) -> int:
+    """Count the samples until a step response of a stable model is at rest."""
+    size = float(np.abs(found.poles()).max())
+    decay = np.log(0.01) / np.log(size) if 0.0 < size < 0.995 else 1000.0
+    return int(np.clip(decay, 20.0, 1000.0)) + found.orders.reach
+
+
+def _pole_chart(estimates: Mapping[str, Estimate], seed: int) -> Chart:
+    curves = []
+    for style, (name, found) in enumerate(estimates.items()):
+        cloud = pole_draws(found, DRAWS, np.random.default_rng(seed)).ravel()
+        p = np.concatenate([found.poles(), cloud])
+        na = found.orders.na
+        curves.append(Curve(name, p.real, p.imag, style=style, marks=na))
+    left, right, half = _window(curves)
+    angle = np.linspace(0.0, 2.0 * np.pi, 2881)
+    x, y = np.cos(angle), np.sin(angle)
+    inside = (left <= x) & (x <= right) & (np.abs(y) <= half)
+    circle = Curve("unit circle", x, np.where(inside, y, np.nan))
+    return Chart(
+        "poles",
+        "Poles, 200 models drawn from P*",
+        "imaginary part [-]",
+        tuple(curves),
+        (circle,),
+        samples=np.array([left, right]),
+        unit="-",
+        across="real part",
+    )
+
+
+def _window(curves: Sequence[Curve]) -> tuple[float, float, float]:
+    """Left, right and half height of a window that shows the poles from near."""
+    if not curves:
+        return -1.1, 1.1, 1.1
+    near = [np.quantile(c.t, (0.02, 0.98)) for c in curves]
+    near += [c.t[: c.marks] for c in curves]
+    left, right = float(np.concatenate(near).min()), float(np.concatenate(near).max())
+    high = max(float(np.abs(c.values[: c.marks]).max()) for c in curves)
+    half = min(max(0.6 * (right - left), 1.3 * high, 0.1), 1.1)
+    room = max(0.15 * (right - left), 0.05)
+    return max(left - room, -1.1), min(right + room, 1.1), half
+
+
+def _correlation_chart(
+    name: str, title: str, correlations: Mapping[str, tuple[Array, float]]
+) -> Chart:
+    """Stems, each drawn from zero and back to it."""
+    curves = []
+    for style, (label, (r, _)) in enumerate(correlations.items()):
+        lags = np.repeat(np.arange(len(r)) + 0.25 * style, 3)
+        stems = np.column_stack([np.zeros_like(r), r, np.zeros_like(r)]).ravel()
+        curves.append(Curve(label, lags, stems, style=style))
+    band = max((pair[1] for pair in correlations.values()), default=np.inf)
+    return Chart(
+        name,
+        title,
+        "correlation [-]",
+        tuple(curves),
+        limits=(-band, band),
+        samples=np.array([-0.5, LAGS + 0.8]),
+        unit="samples",
+        across="lag",
+    )
 
 
 def _outputs(runs: Mapping[str, Run], channel: int) -> tuple[Curve, ...]:
@@ -548,8 +781,74 @@ class ChartFigure:
             start=span[0], end=span[1], reset_start=span[0], reset_end=span[1]
         )
         self.figure.yaxis.axis_label = chart.axis
-        self.figure.xaxis.axis_label = f"time [{chart.unit}]"
+        self.figure.xaxis.axis_label = f"{chart.across} [{chart.unit}]"
         self.figure.title.text = chart.title
+
+
+class EstimateFigure(ChartFigure):
+    """A figure that also draws bands about curves, and curves as points."""
+
+    def __init__(self, chart: Chart, times: Range1d | None = None) -> None:
+        columns = ("t", "low", "high"), ("t", "y", "size")
+        self.bands, self.points = (
+            [ColumnDataSource({key: [] for key in keys}) for _ in STYLES]
+            for keys in columns
+        )
+        super().__init__(chart, times)
+        for number, (band, points) in enumerate(
+            zip(self.bands, self.points, strict=True)
+        ):
+            _add_band(self.figure, band, number)
+            _add_points(self.figure, points, number)
+
+    def show(self, chart: Chart) -> None:
+        """Draw another chart."""
+        lines = tuple(curve for curve in chart.curves if not curve.marks)
+        super().show(dataclasses.replace(chart, curves=lines))
+        low, high = chart.vertical
+        self.figure.y_range.update(start=low, end=high)
+        with_style = {curve.style: curve for curve in chart.curves}
+        for style in range(len(STYLES)):
+            curve = with_style.get(style)
+            self.bands[style].data = _band_columns(curve)
+            self.points[style].data = _point_columns(curve)
+
+
+def _band_columns(curve: Curve | None) -> dict[str, Array]:
+    if curve is None or curve.low is None or curve.high is None:
+        return {key: np.zeros(0) for key in ("t", "low", "high")}
+    return {"t": curve.t, "low": curve.low, "high": curve.high}
+
+
+def _point_columns(curve: Curve | None) -> dict[str, Array]:
+    if curve is None or not curve.marks:
+        return {key: np.zeros(0) for key in ("t", "y", "size")}
+    size = np.where(np.arange(len(curve.t)) < curve.marks, 12.0, 3.0)
+    return {"t": curve.t, "y": curve.values, "size": size}
+
+
+def _add_band(plot: figure, source: ColumnDataSource, number: int) -> None:
+    color = STYLES[number]["color"]
+    band = plot.varea(
+        "t", "low", "high", source=source, fill_color=color, fill_alpha=0.18
+    )
+    band.name, band.level = f"band{number}", "underlay"
+
+
+def _add_points(plot: figure, source: ColumnDataSource, number: int) -> None:
+    style = STYLES[number]
+    points = plot.scatter(
+        "t",
+        "y",
+        size="size",
+        source=source,
+        marker=str(style["marker"]),
+        fill_color=style["color"],
+        line_color=style["color"],
+        fill_alpha=0.3,
+        line_alpha=0.8,
+    )
+    points.name = f"points{number}"
 
 
 def _empty_figure(name: str, times: Range1d | DataRange1d) -> figure:

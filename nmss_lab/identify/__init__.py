@@ -4,8 +4,15 @@
 ``Estimate`` carries its covariance to wherever the model is used.
 """
 
+from nmss_lab.identify.ensemble import pole_draws, step_band, step_response
 from nmss_lab.identify.estimate import Estimate, combine, draw
-from nmss_lab.identify.experiments import expected_errors, multilevel, prbs, staircase
+from nmss_lab.identify.experiments import (
+    expected_errors,
+    experiment,
+    multilevel,
+    prbs,
+    staircase,
+)
 from nmss_lab.identify.fit import least_squares, riv, sriv
 from nmss_lab.identify.noise import fit_noise
 from nmss_lab.identify.search import (
@@ -27,15 +34,19 @@ __all__ = [
     "delay_profile",
     "draw",
     "expected_errors",
+    "experiment",
     "fit_noise",
     "least_squares",
     "multilevel",
     "order_search",
+    "pole_draws",
     "prbs",
     "riv",
     "sriv",
     "stabilised",
     "staircase",
+    "step_band",
+    "step_response",
     "structures",
     "table",
 ]

@@ -177,6 +177,18 @@ class Estimate:
         response = np.asarray(lfilter(ONE, A, impulse))
         return np.column_stack([delayed(response, i) for i in range(self.orders.reach)])
 
+    def explained(self, record: Record, start: Start = "rest") -> Array:
+        """Output (N,) of the model on another record with the same columns.
+
+        With ``start = "estimate"`` the response to what went before is fitted to the
+        record.
+        """
+        y, x = record.y[:, 0], self.simulate(record)
+        if start == "estimate":
+            free = self._free(len(y))
+            x = x + free @ np.linalg.lstsq(free, y - x, rcond=None)[0]
+        return x
+
     def validate(self, record: Record, start: Start = "rest") -> float:
         """R_T^2 of the simulated output on another record with the same columns.
 
@@ -186,10 +198,7 @@ class Estimate:
         start : Start
             With "estimate" the response to what went before is fitted to the record.
         """
-        y, x = record.y[:, 0], self.simulate(record)
-        if start == "estimate":
-            free = self._free(len(y))
-            x = x + free @ np.linalg.lstsq(free, y - x, rcond=None)[0]
+        y, x = record.y[:, 0], self.explained(record, start)
         first = self.orders.reach if start == "skip" else 0
         return 1.0 - _mean_square((y - x)[first:]) / float(np.var(y[first:]))
 
@@ -359,4 +368,5 @@ def _mean_square(error: Array) -> float:
 
 def _correlation(e: Array, u: Array, lags: int) -> Array:
     size = np.sqrt((e @ e) * (u @ u))
-    return np.array([e[i:] @ u[: len(u) - i] for i in range(lags + 1)]) / size
+    with np.errstate(invalid="ignore"):  # a constant input has none
+        return np.array([e[i:] @ u[: len(u) - i] for i in range(lags + 1)]) / size

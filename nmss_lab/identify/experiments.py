@@ -9,7 +9,8 @@ from scipy.signal import lfilter, max_len_seq
 
 from nmss_lab.identify.fit import inverse_product
 from nmss_lab.identify.structure import ONE, Orders
-from nmss_lab.models import Array
+from nmss_lab.models import Array, LinearPlant
+from nmss_lab.records import Record
 
 
 def prbs(
@@ -87,6 +88,45 @@ def _rated(wanted: Array, rate: float) -> Array:
     for k in range(1, len(signal)):
         signal[k] = np.clip(wanted[k], signal[k - 1] - rate, signal[k - 1] + rate)
     return signal
+
+
+def experiment(
+    plant: LinearPlant,
+    signal: Array,
+    noise: float,
+    rng: np.random.Generator,
+    moved: int = 0,
+) -> Record:
+    """Record what a plant at rest does while one of its inputs follows a signal.
+
+    Parameters
+    ----------
+    plant : LinearPlant
+    signal : array (N,)
+    noise : float
+        Standard deviation of white noise on each output, as a share of that of the
+        output itself.
+    rng : numpy.random.Generator
+    moved : int
+        Which input moves; the others rest and are not part of the record.
+
+    Raises
+    ------
+    ValueError
+        If the plant has no such input or the noise is negative.
+    """
+    if not 0 <= moved < plant.n_u or noise < 0.0:
+        raise ValueError(
+            f"moved = {moved}, noise = {noise}: expected an input from 0 to "
+            f"{plant.n_u - 1} and noise of at least 0"
+        )
+    x, y = np.zeros(plant.n_x), np.zeros((len(signal), plant.n_y))
+    for k, u in enumerate(signal):
+        y[k] = plant.C @ x
+        x = plant.A @ x + plant.B[:, moved] * u
+    y += noise * y.std(axis=0) * rng.standard_normal(y.shape)
+    time = plant.dt * np.arange(float(len(signal)))
+    return Record(time, y, signal, names={"u": (f"u{moved + 1}",)})
 
 
 def expected_errors(
