@@ -2,13 +2,6 @@
 // Values go to the server one at a time: the next leaves when the last is answered,
 // so that the latest value wins and nothing queues.
 
-const element = (tag, attributes = {}, ...children) => {
-  const node = document.createElement(tag)
-  for (const [name, value] of Object.entries(attributes)) node.setAttribute(name, value)
-  node.append(...children)
-  return node
-}
-
 const shown = (value) => {
   if (!Number.isFinite(value)) return String(value)
   const text = Number(value.toPrecision(4)).toString()
@@ -104,6 +97,19 @@ export function render({ model, el }) {
     return [element("label", { for: id }, item.label), input]
   }
 
+  const typed = (item, id) => {
+    const input = element("input", {
+      type: "number", id, name: item.name, "aria-describedby": id + "-help",
+      min: item.low, max: item.high, step: "any",
+    })
+    update[item.name] = (value) => { input.value = Number(value.toPrecision(8)) }
+    input.addEventListener("change", () => {
+      if (input.value !== "") choose(item.name, Number(input.value))
+      else update[item.name](values[item.name])
+    })
+    return [element("label", { for: id }, item.label), input]
+  }
+
   const several = (item, id) => {
     const group = element("fieldset", { "aria-describedby": id + "-help" })
     group.append(element("legend", {}, item.label))
@@ -122,7 +128,7 @@ export function render({ model, el }) {
         const place = chosen.indexOf(box.value)
         box.checked = place >= 0
         box.disabled = place < 0 && chosen.length >= item.most
-          || place >= 0 && chosen.length === 1
+          || place >= 0 && chosen.length === (item.least ?? 1)
         mark.className = place >= 0 ? `swatch style${place}` : "swatch"
       }
     }
@@ -143,8 +149,8 @@ export function render({ model, el }) {
       part.append(element("summary", {}, group.title))
       for (const item of group.items) {
         const id = `choice-${item.name}`
-        const make = { one: select, several }[item.kind] ?? slider
-        const kind = { one: "one", several: "several" }[item.kind] ?? "slider"
+        const make = { one: select, several, number: typed }[item.kind] ?? slider
+        const kind = { one: "one", several: "several", number: "field" }[item.kind] ?? "slider"
         const help = element("p", { id: id + "-help", class: "help" })
         help.textContent = item.help
         const choice = element("div", { class: `choice ${kind}` }, ...make(item, id), help)

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import panel as pn
 from panel.viewable import Viewable
 
-from apps.pages import governor, receding_horizon
+from apps.pages import governor, identify, receding_horizon
 from apps.pages.live import Subject, page_template, text_style
 from apps.session import known_case
 
@@ -24,6 +24,9 @@ disturbances, and a plant that differs from its model.</a>
 <a class="card" href="governor"><b>Reference governor</b>
 One loop with and without a governor that bends the reference just enough to keep
 every limit.</a>
+<a class="card" href="identify"><b>Identify</b>
+From a record, shipped or your own, to a ranked table of models with honest
+uncertainty, and from there to a controller.</a>
 </div>
 <h2>Start from an example</h2>
 """
@@ -65,4 +68,5 @@ def pages() -> dict[str, Callable[[], Viewable]]:
         "": index,
         "receding_horizon": receding_horizon.page,
         "governor": governor.page,
+        "identify": identify.page,
     }

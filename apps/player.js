@@ -11,13 +11,6 @@ const ICONS = {
   last: "M19 5v14M5 5l10 7-10 7z",
 }
 
-const element = (tag, attributes = {}, ...children) => {
-  const node = document.createElement(tag)
-  for (const [name, value] of Object.entries(attributes)) node.setAttribute(name, value)
-  node.append(...children)
-  return node
-}
-
 const icon = (name) => {
   const svg = document.createElementNS("http://www.w3.org/2000/svg", "svg")
   svg.setAttribute("viewBox", "0 0 24 24")
@@ -26,16 +19,6 @@ const icon = (name) => {
   path.setAttribute("d", ICONS[name])
   svg.append(path)
   return svg
-}
-
-const figureViews = () => {
-  const found = {}
-  const look = (view) => {
-    if (view.model?.type === "Figure" && view.model.name) found[view.model.name] = view
-    for (const child of view.child_views ?? []) look(child)
-  }
-  for (const root of Object.values(Bokeh.index.roots ?? Bokeh.index)) look(root)
-  return found
 }
 
 export function render({ model, el }) {
@@ -242,15 +225,6 @@ export function render({ model, el }) {
     }))
   }
 
-  const colorsNow = () => {
-    const style = getComputedStyle(document.documentElement)
-    const read = (name) => style.getPropertyValue(name).trim()
-    return {
-      paper: read("--paper"), ink: read("--ink"), quiet: read("--quiet"),
-      styles: [read("--style0"), read("--style1"), read("--style2")],
-    }
-  }
-
   let colors = colorsNow()
   let described = -1
   const draw = (moment) => {
@@ -277,36 +251,9 @@ export function render({ model, el }) {
   }
   const request = () => { if (!frame) frame = requestAnimationFrame(draw) }
 
-  // Colours of the figures follow the page without telling the server
-
   const theme = () => {
     colors = colorsNow()
-    const large = window.innerWidth >= 1900  // a projector, or a wall
-    for (const view of Object.values(views)) {
-      const plot = view.model
-      const size = large ? "15px" : "12px"
-      quietly(plot.title, {
-        text_color: colors.ink, text_font_size: large ? "17px" : "13px",
-      })
-      for (const axis of [...plot.below, ...plot.left]) {
-        if (!axis.type.endsWith("Axis")) continue
-        quietly(axis, {
-          axis_label_text_color: colors.ink, major_label_text_color: colors.ink,
-          axis_label_text_font_size: size, major_label_text_font_size: size,
-          axis_line_color: colors.quiet, major_tick_line_color: colors.quiet,
-        })
-      }
-      for (const renderer of plot.renderers) {
-        const name = renderer.name ?? ""
-        const color = name.startsWith("style") ? colors.styles[name.at(-1)] : colors.ink
-        for (const glyph of [renderer.glyph, renderer.nonselection_glyph]) {
-          quietly(glyph, { line_color: { value: color } })
-        }
-      }
-      for (const side of plot.center) {
-        if (side.name === "limit") quietly(side, { line_color: colors.quiet })
-      }
-    }
+    for (const view of Object.values(views)) recolour(view.model, colors)
     request()
   }
 
@@ -324,8 +271,6 @@ export function render({ model, el }) {
   }
 
   // A new run: curves, ranges and labels go to Bokeh without telling the server
-
-  const quietly = (thing, values) => thing?.setv(values, { sync: false })
 
   const fill = (chart, view) => {
     const plot = view.model

@@ -16,6 +16,12 @@ HERE = Path(__file__).resolve().parent
 STYLE = (HERE / "parts.css").read_text(encoding="utf-8")
 
 
+def script(name: str) -> str:
+    """Text of a component's script, after what all of them share."""
+    parts = (HERE / part for part in ("figures.js", name))
+    return "\n".join(part.read_text(encoding="utf-8") for part in parts)
+
+
 class Controls(JSComponent):
     """A form made from a description of choices.
 
@@ -28,7 +34,7 @@ class Controls(JSComponent):
     state = param.Dict(default={})
     sent = param.Dict(default={})
 
-    _esm = HERE / "controls.js"
+    _esm = script("controls.js")
     _stylesheets = (STYLE,)
     _debounce = 0  # the form itself sends one message at a time
 
@@ -38,7 +44,7 @@ class Player(JSComponent):
 
     run = param.Dict(default={})
 
-    _esm = HERE / "player.js"
+    _esm = script("player.js")
     _stylesheets = (STYLE,)
 
 

@@ -7,6 +7,7 @@ made from the same lines: what the page shows is what its script prints.
 from __future__ import annotations
 
 import functools
+import hashlib
 import math
 from collections.abc import Mapping
 from dataclasses import replace
@@ -15,9 +16,11 @@ from typing import Any, ClassVar
 import numpy as np
 import param
 
-from nmss_lab.cases import CASES, Case, case, piecewise
+from nmss_lab.cases import CASES, Case, case, model_case, piecewise
 from nmss_lab.controller import Limits
 from nmss_lab.design import Design
+from nmss_lab.files import dumps
+from nmss_lab.identify import Estimate
 from nmss_lab.models import LinearPlant
 from nmss_lab.mpc import STRUCTURES
 from nmss_lab.predict import Horizon
@@ -37,9 +40,29 @@ OPENS_WITH = {
 
 
 @functools.cache
-def known_case(name: str) -> Case:
-    """Build a case once; cases are immutable."""
+def _worked_case(name: str) -> Case:
     return case(name)
+
+
+def known_case(name: str) -> Case:
+    """Build a case once; cases are immutable.  Kept models are cases as well."""
+    return KEPT[name] if name in KEPT else _worked_case(name)
+
+
+KEPT: dict[str, Case] = {}
+"""Cases of models that were identified here, by name, the latest last."""
+
+MOST_KEPT = 200
+
+
+def keep_model(estimate: Estimate) -> str:
+    """Keep an identified model for the other pages; return the name of its case."""
+    text = dumps(estimate)
+    name = f"model-{hashlib.sha256(text.encode()).hexdigest()[:12]}"
+    KEPT.setdefault(name, model_case(estimate.to_model(), estimate.covariance, name))
+    while len(KEPT) > MOST_KEPT:
+        del KEPT[next(iter(KEPT))]
+    return name
 
 
 def plain(name: str) -> str:
@@ -56,7 +79,86 @@ def plain(name: str) -> str:
     return special.get(name, name.replace("_", " ").capitalize())
 
 
-class Choices(param.Parameterized):
+class Form(param.Parameterized):
+    """Choices that a form shows: labels, help, bounds, groups."""
+
+    scale: ClassVar[dict[str, str]] = {}
+    when: ClassVar[dict[str, tuple[str, str]]] = {}
+    groups: ClassVar[dict[str, tuple[str, ...]]] = {}
+    fields: ClassVar[tuple[str, ...]] = ()
+    """Numbers that are typed."""
+
+    @classmethod
+    def names(cls) -> list[str]:
+        """Names of all choices, in the order in which a page shows them."""
+        return [key for keys in cls.groups.values() for key in keys]
+
+    def values(self) -> dict[str, Any]:
+        """All choices, as plain data."""
+        return {key: getattr(self, key) for key in self.names()}
+
+    def put(self, values: Mapping[str, Any]) -> None:
+        """Take over values that came from outside, as far as they are allowed.
+
+        Raises
+        ------
+        ValueError
+            Naming the first choice that is not, and what was expected; the others
+            are taken.
+        """
+        wrong = ""
+        for key in (key for key in values if key in self.names()):
+            try:
+                setattr(self, key, self._read(key, values[key]))
+            except (ValueError, TypeError) as error:
+                wrong = wrong or f"{key} = {values[key]!r}: {_short(error)}"
+        if wrong:
+            raise ValueError(wrong)
+
+    def _read(self, key: str, value: Any) -> Any:
+        """Value of a choice, also from the text of an address."""
+        parameter = self.param[key]
+        if isinstance(parameter, param.ListSelector):
+            return _parts(value) if isinstance(value, str) else list(value)
+        if isinstance(parameter, param.Integer):
+            return int(value)
+        if isinstance(parameter, param.Number):
+            return float(value)
+        return value
+
+    def description(self) -> list[dict[str, Any]]:
+        """Describe groups of controls: what a form needs to show each choice."""
+        return [
+            {"title": title, "items": [self._item(k) for k in keys if self._shown(k)]}
+            for title, keys in self.groups.items()
+        ]
+
+    def _shown(self, key: str) -> bool:
+        return True
+
+    def _item(self, key: str) -> dict[str, Any]:
+        parameter = self.param[key]
+        item = {"name": key, "label": parameter.label, "help": parameter.doc}
+        item["when"] = self.when.get(key)
+        if isinstance(parameter, param.ListSelector):
+            options = [[name, self._word(key, name)] for name in parameter.objects]
+            return {**item, "kind": "several", "options": options, "most": MOST_RUNS}
+        if isinstance(parameter, param.Selector):
+            return {**item, "kind": "one", "options": self._options(key)}
+        low, high = parameter.bounds
+        step = parameter.step or (1 if isinstance(parameter, param.Integer) else None)
+        kind = "log" if self.scale.get(key) == "log" else "linear"
+        kind = "number" if key in self.fields else kind
+        return {**item, "kind": kind, "low": low, "high": high, "step": step}
+
+    def _options(self, key: str) -> list[list[str]]:
+        return [[name, self._word(key, name)] for name in self.param[key].objects]
+
+    def _word(self, key: str, name: str) -> str:
+        return plain(name)
+
+
+class Choices(Form):
     """What both pages share: case, limits, plant against model, disturbances."""
 
     case = param.Selector(
@@ -205,53 +307,31 @@ class Choices(param.Parameterized):
             Naming the first choice that is not, and what was expected; the others
             are taken.
         """
-        wrong = ""
         if "case" in values and values["case"] != self.case:
-            if values["case"] not in self.cases():
-                raise ValueError(
-                    f"case = {values['case']!r}: there is no such case here"
-                )
+            self._welcome(values["case"])
             self.take_case(values["case"])
-        for key in (k for k in values if k in self.names() and k != "case"):
-            try:
-                setattr(self, key, self._read(key, values[key]))
-            except (ValueError, TypeError) as error:
-                wrong = wrong or f"{key} = {values[key]!r}: {_short(error)}"
-        if wrong:
-            raise ValueError(wrong)
+        self.put({key: value for key, value in values.items() if key != "case"})
 
-    def _read(self, key: str, value: Any) -> Any:
-        """Value of a choice, also from the text of an address."""
-        parameter = self.param[key]
-        if isinstance(parameter, param.ListSelector):
-            return value.split(",") if isinstance(value, str) else list(value)
-        if isinstance(parameter, param.Integer):
-            return int(value)
-        if isinstance(parameter, param.Number):
-            return float(value)
-        return value
+    def _welcome(self, name: str) -> None:
+        """Let in a case, one of a kept model among them.
 
-    @classmethod
-    def names(cls) -> list[str]:
-        """Names of all choices, in the order in which a page shows them."""
-        return [key for keys in cls.groups.values() for key in keys]
-
-    def values(self) -> dict[str, Any]:
-        """All choices, as plain data."""
-        return {key: getattr(self, key) for key in self.names()}
+        Raises
+        ------
+        ValueError
+            If there is no such case, or no longer.
+        """
+        known = self.param["case"].objects
+        if name in KEPT and name not in known:
+            self.param["case"].objects = [*known, name]
+        elif name not in known:
+            gone = "; its model is no longer kept" if name.startswith("model-") else ""
+            raise ValueError(f"case = {name!r}: there is no such case here{gone}")
 
     def defaults(self) -> dict[str, Any]:
         """All choices as they are when the case is chosen."""
         fresh = type(self)()
         fresh.take_case(self.case)
         return {**fresh.values(), "case": self.default_case}
-
-    def description(self) -> list[dict[str, Any]]:
-        """Describe groups of controls: what a form needs to show each choice."""
-        return [
-            {"title": title, "items": [self._item(k) for k in keys if self._shown(k)]}
-            for title, keys in self.groups.items()
-        ]
 
     def _shown(self, key: str) -> bool:
         model = self.example.model
@@ -260,32 +340,19 @@ class Choices(param.Parameterized):
         )
 
     def _item(self, key: str) -> dict[str, Any]:
-        parameter = self.param[key]
-        item = {"name": key, "label": parameter.label, "help": parameter.doc}
-        item["when"] = self.when.get(key)
-        if isinstance(parameter, param.ListSelector):
-            options = [[name, plain(name)] for name in parameter.objects]
-            return {**item, "kind": "several", "options": options, "most": MOST_RUNS}
-        if isinstance(parameter, param.Selector):
-            return {**item, "kind": "one", "options": self._options(key)}
-        if key in ("output", "input"):
-            model = self.example.model
-            names = model.y_names if key == "output" else model.u_names
-            return {
-                **item,
-                "kind": "one",
-                "options": [[i, n] for i, n in enumerate(names)],
-            }
-        low, high = parameter.bounds
-        step = parameter.step or (1 if isinstance(parameter, param.Integer) else None)
-        kind = "log" if self.scale.get(key) == "log" else "linear"
-        return {**item, "kind": kind, "low": low, "high": high, "step": step}
+        item = super()._item(key)
+        if key not in ("output", "input"):
+            return item
+        model = self.example.model
+        names = model.y_names if key == "output" else model.u_names
+        return {**item, "kind": "one", "options": [[i, n] for i, n in enumerate(names)]}
 
-    def _options(self, key: str) -> list[list[str]]:
+    def _word(self, key: str, name: str) -> str:
         if key == "case":
-            return [[name, _case_title(known_case(name))] for name in self.cases()]
-        words = {"case": "as in the case", "off": "none"}
-        return [[name, words.get(name, name)] for name in self.param[key].objects]
+            return _case_title(known_case(name))
+        if key == "structures":
+            return plain(name)
+        return {"case": "as in the case", "off": "none"}.get(name, name)
 
     # From choices to runs. Every line here has its twin in ``script``.
 
@@ -387,9 +454,9 @@ class Choices(param.Parameterized):
     def script(self) -> str:
         """Python that computes what the page shows and prints its measures."""
         lines = [
-            *_SCRIPT_IMPORTS,
+            *(_KEPT_IMPORTS if self.case in KEPT else _SCRIPT_IMPORTS),
             "",
-            f'example = case("{self.case}")',
+            *self._case_lines(),
             *self._plant_lines(),
             *self._scenario_lines(),
             "",
@@ -399,6 +466,15 @@ class Choices(param.Parameterized):
             "    print(row)",
         ]
         return "\n".join(lines) + "\n"
+
+    def _case_lines(self) -> list[str]:
+        if self.case not in KEPT:
+            return [f'example = case("{self.case}")']
+        return [
+            "# model.json: saved on the page Identify",
+            'found = load("model.json")',
+            "example = model_case(found.to_model(), found.covariance)",
+        ]
 
     def _plant_lines(self) -> list[str]:
         lines = ["plant = example.plant"]
@@ -708,8 +784,20 @@ _SCRIPT_IMPORTS = (
 )
 
 
+_KEPT_IMPORTS = tuple(
+    line.replace("import case,", "import model_case,")
+    + ("\nfrom nmss_lab.files import load" if "nmss_lab.cases" in line else "")
+    for line in _SCRIPT_IMPORTS
+)
+
+
+def _parts(text: str) -> list[str]:
+    """Names in an address, separated by commas."""
+    return [part for part in text.split(",") if part]
+
+
 def _case_title(example: Case) -> str:
-    return f"{example.section}  {example.title}"
+    return f"{example.section}  {example.title}".strip()
 
 
 def _first_choice(predictive: list[str]) -> list[str]:

@@ -13,7 +13,7 @@ import pytest
 from conftest import Server
 from playwright.sync_api import Page
 
-PATHS = ["", "receding_horizon", "governor"]
+PATHS = ["", "receding_horizon", "governor", "identify"]
 """The pages of this version; the empty path is the index."""
 
 LOADING = {

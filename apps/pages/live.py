@@ -23,7 +23,11 @@ from nmss_lab.simulate import Run
 
 LOG = logging.getLogger(__name__)
 HERE = Path(__file__).resolve().parent.parent
-PAGES = (("receding_horizon", "Receding horizon"), ("governor", "Reference governor"))
+PAGES = (
+    ("receding_horizon", "Receding horizon"),
+    ("governor", "Reference governor"),
+    ("identify", "Identify"),
+)
 
 PARTS = "lead", "alert", "player", "measures", "python", "notes", "controls"
 

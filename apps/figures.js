@@ -1,0 +1,60 @@
+// What components in the browser share: elements, and figures in the page's colours.
+
+const element = (tag, attributes = {}, ...children) => {
+  const node = document.createElement(tag)
+  for (const [name, value] of Object.entries(attributes)) node.setAttribute(name, value)
+  node.append(...children)
+  return node
+}
+
+const figureViews = () => {
+  const found = {}
+  const look = (view) => {
+    if (view.model?.type === "Figure" && view.model.name) found[view.model.name] = view
+    for (const child of view.child_views ?? []) look(child)
+  }
+  for (const root of Object.values(Bokeh.index.roots ?? Bokeh.index)) look(root)
+  return found
+}
+
+// Properties of Bokeh's models, set without telling the server.
+const quietly = (thing, values) => thing?.setv(values, { sync: false })
+
+const colorsNow = () => {
+  const style = getComputedStyle(document.documentElement)
+  const read = (name) => style.getPropertyValue(name).trim()
+  return {
+    paper: read("--paper"), ink: read("--ink"), quiet: read("--quiet"),
+    styles: [read("--style0"), read("--style1"), read("--style2")],
+  }
+}
+
+const recolour = (plot, colors) => {
+  const large = window.innerWidth >= 1900  // a projector, or a wall
+  const size = large ? "15px" : "12px"
+  quietly(plot.title, {
+    text_color: colors.ink, text_font_size: large ? "17px" : "13px",
+  })
+  for (const axis of [...plot.below, ...plot.left]) {
+    if (!axis.type.endsWith("Axis")) continue
+    quietly(axis, {
+      axis_label_text_color: colors.ink, major_label_text_color: colors.ink,
+      axis_label_text_font_size: size, major_label_text_font_size: size,
+      axis_line_color: colors.quiet, major_tick_line_color: colors.quiet,
+    })
+  }
+  for (const renderer of plot.renderers) {
+    const color = { value: colors.styles[(renderer.name ?? "").at(-1)] ?? colors.ink }
+    const kind = (renderer.name ?? "").slice(0, -1)
+    const values = kind === "band" ? { fill_color: color }
+      : kind === "points" ? { fill_color: color, line_color: color }
+      : { line_color: color }
+    for (const glyph of [renderer.glyph, renderer.nonselection_glyph]) {
+      quietly(glyph, values)
+    }
+  }
+  for (const side of plot.center) {
+    if (side.name === "limit") quietly(side, { line_color: colors.quiet })
+  }
+}
+

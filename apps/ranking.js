@@ -1,0 +1,130 @@
+// A search: its button and progress, the ranking it leaves, what is done with a row.
+
+const COLUMNS = [
+  ["orders", "[na nb nk]", "Orders: coefficients a, coefficients b and delay of each input"],
+  ["yic", "YIC", "Young's criterion: large negative is good"],
+  ["bic", "BIC", "Schwarz's criterion: small is good"],
+  ["r2_t", "R\u00b2 fit", "R_T squared of the simulated output, on the span for estimation"],
+  ["checked", "R\u00b2 valid.", "R_T squared of the simulated output, on the span for validation"],
+  ["problem", "Problem", "Why a row is not to be trusted"],
+]
+
+const worded = (value, digits) => value === null || value === undefined
+  ? "\u2013" : Number(value.toFixed(digits)).toString().replace("-", "\u2212")
+
+export function render({ model, el }) {
+  let order = { key: "yic", down: false }
+  let sent = 0
+  const tell = (message) => { model.sent = { ...message, number: ++sent } }
+  const button = (text, action, main = false) => {
+    const made = element("button", { type: "button", class: main ? "act main" : "act" }, text)
+    made.addEventListener("click", action)
+    return made
+  }
+  const go = button("Search", () => tell({ act: "search" }), true)
+  const stop = button("Cancel", () => tell({ act: "cancel" }))
+  const bar = element("progress", { max: 1, value: 0, "aria-label": "Progress of the search" })
+  const note = element("span", { class: "note", role: "status" })
+  const head = element("tr")
+  const body = element("tbody")
+  const table = element("table", {}, element("thead", {}, head), body)
+  table.setAttribute("aria-label", "Ranking of models")
+  const box = element("div", { class: "rows", tabindex: "0", role: "region", "aria-label": "Ranking of models" }, table)
+  const empty = element("p", { class: "quiet" })
+  const picked = element("div", { class: "picked" })
+  el.append(element("div", { class: "ranking" },
+    element("div", { class: "search" }, go, stop, bar, note), empty, box, picked))
+
+  const sorters = COLUMNS.map(([key, text, title]) => {
+    const cell = element("th", { scope: "col" })
+    const sorter = element("button", { type: "button", class: "sort", title }, text)
+    sorter.addEventListener("click", () => {
+      order = { key, down: order.key === key && !order.down }
+      fill()
+    })
+    cell.append(sorter)
+    head.append(cell)
+    return [key, cell]
+  })
+
+  const before = (a, b) => {
+    const [x, y] = [a[order.key], b[order.key]]
+    if (Boolean(a.problem) !== Boolean(b.problem) && order.key !== "problem") return a.problem ? 1 : -1
+    if (x === null || y === null) return (x === null) - (y === null)
+    const sign = order.down ? -1 : 1
+    return sign * (typeof x === "string" ? x.localeCompare(y) : x - y)
+  }
+
+  const fill = () => {
+    const root = el.getRootNode()
+    const focused = root.activeElement?.dataset?.id
+    for (const [key, cell] of sorters) {
+      cell.ariaSort = key === order.key ? (order.down ? "descending" : "ascending") : "none"
+    }
+    const chosen = model.chosen
+    body.replaceChildren(...[...model.rows].sort(before).map((row) => {
+      const place = chosen.indexOf(row.id)
+      const tick = element("input", { type: "checkbox", "data-id": row.id })
+      tick.checked = place >= 0
+      tick.disabled = !row.usable || (place < 0 && chosen.length >= 3)
+      tick.addEventListener("change", () => {
+        const others = model.chosen.filter((id) => id !== row.id)
+        tell({ act: "choose", chosen: tick.checked ? [...others, row.id] : others })
+      })
+      const mark = element("span", { class: place >= 0 ? `swatch style${place}` : "swatch" })
+      const name = element("label", { class: "check" }, tick, mark, row.orders)
+      const line = element("tr", {}, element("th", { scope: "row" }, name),
+        element("td", {}, worded(row.yic, 2)), element("td", {}, worded(row.bic, 1)),
+        element("td", {}, worded(row.r2_t, 4)), element("td", {}, worded(row.checked, 4)),
+        element("td", { class: "problem", title: row.problem }, row.problem))
+      if (row.problem) line.classList.add("bad")
+      return line
+    }))
+    if (focused !== undefined) body.querySelector(`[data-id="${focused}"]`)?.focus()
+    box.hidden = model.rows.length === 0
+    picked.replaceChildren(...chosen.map((id, place) => {
+      const row = model.rows.find((one) => one.id === id)
+      return element("div", {}, element("span", { class: `swatch style${place}` }),
+        element("b", {}, row?.orders ?? ""),
+        button("Control it: Receding horizon", () => tell({ act: "send", id })),
+        button("Save as JSON", () => tell({ act: "save", id })))
+    }))
+  }
+
+  const progress = () => {
+    const { running, done, total, note: text, hint } = model.progress
+    go.textContent = `Search ${total} structure${total === 1 ? "" : "s"}`
+    go.disabled = running
+    stop.disabled = !running
+    stop.hidden = bar.hidden = !running
+    bar.max = total
+    bar.value = done
+    note.textContent = text
+    empty.textContent = hint
+    empty.hidden = !hint
+  }
+
+  const colour = () => {
+    const colors = colorsNow()
+    const views = Object.values(figureViews())
+    if (views.length < model.figures) { setTimeout(colour, 60); return }
+    for (const view of views) recolour(view.model, colors)
+    window.nmssIdentify = { drawn: views.length, rows: () => model.rows.length, running: () => model.progress.running }
+  }
+  window.addEventListener("nmss-theme", colour)
+  model.on("remove", () => window.removeEventListener("nmss-theme", colour))
+  model.on("rows", fill)
+  model.on("chosen", fill)
+  model.on("progress", progress)
+  model.on("saved", () => {
+    const { name, text } = model.saved
+    const link = element("a", { download: name })
+    link.href = URL.createObjectURL(new Blob([text], { type: "application/json" }))
+    link.click()
+    setTimeout(() => URL.revokeObjectURL(link.href), 1000)
+  })
+  model.on("leads", () => location.assign(model.leads.to))
+  fill()
+  progress()
+  colour()
+}
