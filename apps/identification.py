@@ -488,12 +488,15 @@ class IdentifyChoices(Form):
             if values.get("record", self.record) != self.record:
                 self.take_record(values["record"])
             old = self._of_record()
-            self.put({key: v for key, v in values.items() if key != "record"})
+            late = {"record", *self.spans}
+            self.put({key: v for key, v in values.items() if key not in late})
+            spans = {key: values[key] for key in self.spans if key in values}
             if self._of_record() != old:
                 self._load()
-                self.put({k: values[k] for k in self.spans if values[k] != before[k]})
+                spans = {k: v for k, v in spans.items() if v != before[k]}
+            self.put(spans)
             self._check_spans()
-        except (ValueError, KeyError):
+        except ValueError:
             self._restore(before)
             raise
 

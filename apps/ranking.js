@@ -15,6 +15,8 @@ const worded = (value, digits) => value === null || value === undefined
 export function render({ model, el }) {
   let order = { key: "yic", down: false }
   let sent = 0
+  let searched = false
+  const statistics = { finished: 0 }  // for tests and measurements
   const tell = (message) => { model.sent = { ...message, number: ++sent } }
   const button = (text, action, main = false) => {
     const made = element("button", { type: "button", class: main ? "act main" : "act" }, text)
@@ -93,6 +95,8 @@ export function render({ model, el }) {
 
   const progress = () => {
     const { running, done, total, note: text, hint } = model.progress
+    if (searched && !running) statistics.finished += 1
+    searched = running
     go.textContent = `Search ${total} structure${total === 1 ? "" : "s"}`
     go.disabled = running
     stop.disabled = !running
@@ -109,7 +113,9 @@ export function render({ model, el }) {
     const views = Object.values(figureViews())
     if (views.length < model.figures) { setTimeout(colour, 60); return }
     for (const view of views) recolour(view.model, colors)
-    window.nmssIdentify = { drawn: views.length, rows: () => model.rows.length, running: () => model.progress.running }
+    window.nmssIdentify = Object.assign(statistics, {
+      rows: () => model.rows.length, running: () => model.progress.running,
+    })
   }
   window.addEventListener("nmss-theme", colour)
   model.on("remove", () => window.removeEventListener("nmss-theme", colour))

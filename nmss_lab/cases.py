@@ -1012,12 +1012,12 @@ def model_case(
     integral = dataclasses.replace(
         design,
         structure="integral_of_error",
-        Q=state_weight(model, 1.0 / model.na, 0.0, 1.0 / tau**2),
+        Q=state_weight(model, 1.0 / model.na, 0.0, 0.3),
         reference="zero",
     )
     return Case(
         name=name,
-        title="Your model",
+        title=f"Your model of {model.y_names[0]}",
         section="",
         source="Identified from a record",
         plant=model.plant(),

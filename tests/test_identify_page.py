@@ -242,6 +242,21 @@ def test_choices_are_taken_whole_or_not_at_all() -> None:
         IdentifyChoices().accept({"record": "file"})
 
 
+def test_links_name_what_differs() -> None:
+    """What an address holds is taken in the order in which it makes sense."""
+    choices = IdentifyChoices()
+    choices.accept({"est_to": "300", "record": "ifac93", "samples": "1000"})
+    assert (choices.record, choices.samples, choices.est_to) == ("ifac93", 1000, 300.0)
+    assert len(choices.fitted.time) == 600
+    choices.accept({"record": "shell", "clock": "20"})
+    assert choices.est_to == choices.val_from
+    before = choices.values()
+    for wrong in ({"record": "<b>"}, {"record": "file"}, {"method": "x"}):
+        with pytest.raises(ValueError, match=r"."):
+            choices.accept(wrong)
+        assert choices.values() == before
+
+
 def test_every_choice_is_explained() -> None:
     """Each control has a label and a sentence of help."""
     for name in OWN:
@@ -323,6 +338,13 @@ def choose(page: Page, name: str, value: str) -> None:
     page.wait_for_function(DONE, timeout=60_000)
 
 
+def search(page: Page) -> None:
+    """Start a search and wait until it has ended."""
+    before = page.evaluate("nmssIdentify.finished")
+    page.get_by_role("button", name="Search").click()
+    page.wait_for_function(f"nmssIdentify.finished > {before}", timeout=60_000)
+
+
 def upload(page: Page, data: bytes, name: str = "mine.csv") -> None:
     """Give a file to the page."""
     page.locator("input[name=upload]").set_input_files(
@@ -353,7 +375,7 @@ def test_each_record_from_data_to_controller(visit: Open, server: Server) -> Non
     page.wait_for_function("window.nmssPlayer?.frames > 0", timeout=60_000)
     assert page.url.startswith(f"{server.url}receding_horizon?case=model-")
     chosen = page.locator("select[name=case] option:checked")
-    expect(chosen).to_have_text("Your model")
+    expect(chosen).to_contain_text("Your model of")
     expect(page.locator(".text-measures tbody tr")).to_have_count(2)
     expect(page.locator(".wrong")).to_have_count(0)
     assert "Traceback" not in server.log.read_text()
@@ -405,8 +427,7 @@ def test_spans_by_mouse_and_by_keyboard(visit: Open) -> None:
         "Bokeh.documents[0].get_model_by_name('span-est').right === 1200"
     )
     page.wait_for_function("location.search.includes('est_to=1200')")
-    page.get_by_role("button", name="Search 30").click()
-    page.wait_for_function(DONE)
+    search(page)
     address = page.evaluate("location.pathname.slice(1) + location.search")
     again = visit(address)
     expect(again.locator("input[name=est_to]")).to_have_value("1200")
@@ -426,8 +447,7 @@ def test_upload_of_a_good_file(visit: Open) -> None:
     expect(page.locator("select[name=time]")).to_have_value('"time"')
     expect(page.locator(".ranking > .quiet")).to_contain_text("Nothing searched yet")
     expect(page.locator(".text-lead")).to_contain_text("<b>mine</b>.csv")
-    page.get_by_role("button", name="Search").click()
-    page.wait_for_function(DONE)
+    search(page)
     assert ranking(page)[0].startswith("[1 1 1]")
     expect(page.locator(".text-measures")).to_contain_text("gain of <img src=x")
     assert page.locator("img").count() == 0

@@ -125,7 +125,7 @@ class IdentifyPage:
         """Take over what the form sent, show, and answer."""
         sent = dict(event.new)
         message, record = sent.pop("message", 0), self.choices.record
-        before = self.choices._of_record()
+        before, seen = self.choices._of_record(), self._seen
         self._guard(lambda: self._accept(sent), self.choices.values())
         fresh = self.choices._of_record() != before
         if fresh:
@@ -135,10 +135,18 @@ class IdentifyPage:
                 self._begin()
         if fresh or record != self.choices.record:
             self.controls.form = self._form()
-        self._draw_record()
+        if self._seen != seen or self.complaint:
+            self._draw_record()
         self._tell()
         self.ranking.progress = self._progress(0)
         self.controls.state = self._state(message)
+
+    @property
+    def _seen(self) -> tuple[Any, ...]:
+        """Choices that the plot of the record depends on."""
+        choices = self.choices
+        spans = (getattr(choices, key) for key in choices.spans)
+        return (*choices._of_record(), choices.detrend, *spans)
 
     def _accept(self, sent: dict[str, Any]) -> None:
         if sent.pop("reset", False):
