@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import csv
+import functools
 import io
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -633,8 +634,12 @@ class IdentifyChoices(Form):
         inputs = len(self.whole.names["u"]) + len(self.whole.names["v"])
         return int(na * (nb * nk) ** inputs)
 
-    def search(self, progress: Any = None) -> list[Candidate]:
-        """Fit every structure chosen.
+    def search(self) -> Callable[..., list[Candidate]]:
+        """Prepare to fit every structure chosen; later choices do not matter to it.
+
+        Returns
+        -------
+        function of progress, as ``order_search`` takes it
 
         Raises
         ------
@@ -649,8 +654,8 @@ class IdentifyChoices(Form):
         na, nb, nk = (range(low, high + 1) for low, high in self._ranges())
         noise = Noise(self.ar) if self.method == "riv" else None
         start: Start = self.start
-        return order_search(
-            self.fitted, na, nb, nk, noise, progress=progress, start=start
+        return functools.partial(
+            order_search, self.fitted, na, nb, nk, noise, start=start
         )
 
     # Words and Python

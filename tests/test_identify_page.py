@@ -170,7 +170,7 @@ def test_python_shown_finds_the_same(
     choices.na_high = choices.nb_high = 2
     assert name in LOOK
     names: dict[str, Any] = {}
-    found = choices.search()
+    found = choices.search()()
     with contextlib.redirect_stdout(io.StringIO()):
         exec(
             compile(choices.script(str(found[1].orders)), "shown", "exec"),
@@ -427,7 +427,10 @@ def test_spans_by_mouse_and_by_keyboard(visit: Open) -> None:
         "Bokeh.documents[0].get_model_by_name('span-est').right === 1200"
     )
     page.wait_for_function("location.search.includes('est_to=1200')")
+    note = page.locator(".note")
+    expect(note).to_contain_text("with earlier choices")
     search(page)
+    expect(note).not_to_contain_text("earlier")
     address = page.evaluate("location.pathname.slice(1) + location.search")
     again = visit(address)
     expect(again.locator("input[name=est_to]")).to_have_value("1200")

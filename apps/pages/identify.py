@@ -91,6 +91,8 @@ class IdentifyPage:
         self.stop = threading.Event()
         self.search: Future[None] | None = None
         self.hint = self.note = ""
+        self.searched: tuple[Any, ...] = ()
+        self.total = 0
         self.document, self.served = pn.state.curdoc, False
         self.lead, self.alert, self.measures, self.python = (
             _text(name) for name in ("lead", "alert", "measures", "python")
@@ -147,6 +149,11 @@ class IdentifyPage:
         choices = self.choices
         spans = (getattr(choices, key) for key in choices.spans)
         return (*choices._of_record(), choices.detrend, *spans)
+
+    @property
+    def _asked(self) -> tuple[Any, ...]:
+        """All choices: what a ranking was asked for with."""
+        return tuple(repr(value) for value in self.choices.values().values())
 
     def _accept(self, sent: dict[str, Any]) -> None:
         if sent.pop("reset", False):
@@ -232,17 +239,22 @@ class IdentifyPage:
         self.stop = stop = threading.Event()
         self.hint = ""
         try:
-            fitted, checked = self.choices.fitted, self.choices.checked
+            job, checked = self.choices.search(), self.choices.checked
         except ValueError as error:
             self.complaint = str(error)
             self._tell()
             return
-        del fitted
+        self.searched, self.total = self._asked, self.choices.tries
         self.note = "Waiting for its turn"
-        self.search = WORKERS.submit(self._work, stop, checked)
+        self.search = WORKERS.submit(self._work, stop, job, checked)
         self.ranking.progress = self._progress(0)
 
-    def _work(self, stop: threading.Event, checked: Any) -> None:
+    def _work(
+        self,
+        stop: threading.Event,
+        job: Callable[..., list[Candidate]],
+        checked: Any,
+    ) -> None:
         """Search, in a thread of its own; what it says is said on the event loop."""
         told = 0.0
 
@@ -255,7 +267,7 @@ class IdentifyPage:
             return stop.is_set()
 
         try:
-            found = [] if stop.is_set() else self.choices.search(progress)
+            found = [] if stop.is_set() else job(progress=progress)
             rows = [_row(i, c, checked) for i, c in enumerate(found)]
         except ValueError as error:
             text = str(error)
@@ -276,7 +288,7 @@ class IdentifyPage:
 
     def _counted(self, stop: threading.Event, done: int) -> None:
         if stop is self.stop and self.search is not None:
-            self.note = f"{done} of {self.choices.tries}"
+            self.note = f"{done} of {self.total}"
             self.ranking.progress = self._progress(done)
 
     def _failed(self, stop: threading.Event, text: str) -> None:
@@ -400,11 +412,13 @@ class IdentifyPage:
         self.python.object = f"<pre>{html.escape(choices.script(orders))}</pre>"
 
     def _progress(self, done: int) -> dict[str, Any]:
+        running = self.search is not None
+        stale = bool(self.found) and not running and self.searched != self._asked
         return {
-            "running": self.search is not None,
+            "running": running,
             "done": done,
-            "total": self.choices.tries,
-            "note": self.note,
+            "total": self.total if running else self.choices.tries,
+            "note": f"{self.note}, with earlier choices" if stale else self.note,
             "hint": self.hint,
         }
 
