@@ -14,6 +14,8 @@ export function render({ model, el }) {
   let values = {}
   let waiting = null   // number of the message that is not answered yet
   let changed = false  // whether values changed since it was sent
+  let touched = {}     // and which
+  let items = {}       // description of each control, as text
   let sent = 0
   let address = 0
   let painted = () => {}
@@ -31,6 +33,7 @@ export function render({ model, el }) {
   const send = () => {
     if (waiting !== null) { changed = true; return }
     changed = false
+    touched = {}
     busy = setTimeout(() => { document.documentElement.dataset.busy = "" }, 300)
     const left = performance.now()
     painted = () => {
@@ -44,6 +47,7 @@ export function render({ model, el }) {
 
   const choose = (name, value) => {
     values[name] = value
+    touched[name] = value
     if (update[name]) update[name](value)
     needed()
     send()
@@ -142,12 +146,14 @@ export function render({ model, el }) {
     }
     form.replaceChildren()
     for (const name of Object.keys(update)) delete update[name]
+    items = {}
     for (const [number, group] of model.form.groups.entries()) {
       const part = element("details", {})
       part.dataset.title = group.title
       part.open = open[group.title] ?? true
       part.append(element("summary", {}, group.title))
       for (const item of group.items) {
+        items[item.name] = JSON.stringify(item)
         const id = `choice-${item.name}`
         const make = { one: select, several, number: typed }[item.kind] ?? slider
         const kind = { one: "one", several: "several", number: "field" }[item.kind] ?? "slider"
@@ -189,11 +195,24 @@ export function render({ model, el }) {
     delete document.documentElement.dataset.busy
     const done = painted
     requestAnimationFrame(() => setTimeout(done, 0))
+    if (stale) { renew(); return }
     if (changed) { send(); return }
-    if (stale) build()
-    else take()
-    stale = false
+    take()
     writeAddress()
   })
+
+  // A new form has values of its own; what was touched while it was on its way stays
+  // only where its control is still the same one.
+  const renew = () => {
+    const before = items, later = Object.entries(touched)
+    stale = changed = false
+    touched = {}
+    build()
+    writeAddress()
+    for (const [name, value] of later) {
+      if (name === "reset" || before[name] === items[name]) choose(name, value)
+    }
+  }
+
   build()
 }

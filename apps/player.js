@@ -272,12 +272,16 @@ export function render({ model, el }) {
 
   // A new run: curves, ranges and labels go to Bokeh without telling the server
 
+  // Bokeh's arrays do not know subarray: it would give the whole of them again
+  const part = (start, size) =>
+    new Float32Array(run.data.buffer, run.data.byteOffset + 4 * start, size)
+
   const fill = (chart, view) => {
     const plot = view.model
     for (const { name, start, size } of chart.lines) {
       const source = plot.renderers.find((renderer) => renderer.name === name).data_source
-      source.data.t = run.data.subarray(start, start + size)
-      source.data.y = run.data.subarray(start + size, start + 2 * size)
+      source.data.t = part(start, size)
+      source.data.y = part(start + size, size)
       source.change.emit()
     }
     const limits = plot.center.filter((side) => side.name === "limit")

@@ -596,6 +596,12 @@ class LoopChoices(Choices):
             raise ValueError(
                 f"structures: {len(self.structures)} chosen, expected 1 to {MOST_RUNS}"
             )
+        for name in self.structures:
+            if name not in self.example.designs:
+                raise ValueError(
+                    f"structures: this case has no {name!r}; it has "
+                    f"{', '.join(self._predictive)}"
+                )
         return {
             name: self._changed(self.example.designs[name]) for name in self.structures
         }

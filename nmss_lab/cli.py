@@ -37,6 +37,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     command: Callable[[argparse.Namespace], None] = arguments.command
     try:
         command(arguments)
+    except BrokenPipeError:  # whoever read the output, such as head, has enough
+        sys.stdout = open(os.devnull, "w")  # noqa: SIM115 - closed with the process
     except (ValueError, OSError) as error:
         print(f"nmss-lab: {error}", file=sys.stderr)
         return 1
@@ -61,7 +63,7 @@ def _parser() -> argparse.ArgumentParser:
 
 def _add_serve(commands: Any) -> None:
     serve = commands.add_parser("serve", help="serve the live pages")
-    serve.add_argument("--port", type=int, default=5006, help="0 takes any free port")
+    serve.add_argument("--port", type=_port, default=5006, help="0 takes any free port")
     serve.add_argument("--address", default="127.0.0.1", help="address to listen on")
     serve.add_argument("--show", action="store_true", help="open the web browser")
     serve.set_defaults(command=_serve)
@@ -106,10 +108,19 @@ def _add_identify(commands: Any) -> None:
     )
     starts = "rest", "skip", "estimate"
     add("--start", choices=starts, default="rest", help="state before the record")
-    add("--na", type=_range, default=(1, 2, 3), help="past outputs, such as 1-3")
-    add("--nb", type=_range, default=(1, 2, 3), help="coefficients an input")
-    add("--nk", type=_range, default=(1, 2, 3, 4, 5), help="delay of each input")
-    add("--noise", type=_range, metavar="AR[,MA]", help="noise model: RIV, not SRIV")
+    add(
+        "--na", type=_whole_numbers, default=(1, 2, 3), help="past outputs, such as 1-3"
+    )
+    add("--nb", type=_whole_numbers, default=(1, 2, 3), help="coefficients an input")
+    add(
+        "--nk", type=_whole_numbers, default=(1, 2, 3, 4, 5), help="delay of each input"
+    )
+    add(
+        "--noise",
+        type=_noise_orders,
+        metavar="AR[,MA]",
+        help="noise model: RIV, not SRIV",
+    )
     add("--model", metavar="FILE", help="write the best estimate, with covariance")
     identify.set_defaults(command=_identify)
 
@@ -118,13 +129,35 @@ def _names(text: str) -> tuple[str, ...]:
     return tuple(name.strip() for name in text.split(",") if name.strip())
 
 
-def _range(text: str) -> tuple[int, ...]:
+def _whole_numbers(text: str) -> tuple[int, ...]:
     """Whole numbers out of "1-3", "2" or "1,3"."""
     found: list[int] = []
-    for part in text.split(","):
-        first, _, last = part.partition("-")
-        found += range(int(first), int(last or first) + 1)
+    try:
+        for part in text.split(","):
+            first, _, last = part.partition("-")
+            found += range(int(first), int(last or first) + 1)
+    except ValueError:
+        found = []
+    if not found:
+        raise argparse.ArgumentTypeError(
+            f"{text!r}: expected numbers such as 1-3 or 2,4"
+        )
     return tuple(found)
+
+
+def _noise_orders(text: str) -> tuple[int, ...]:
+    """One or two orders out of "2" or "2,1"."""
+    orders = _whole_numbers(text)
+    if len(orders) > 2 or "-" in text:
+        raise argparse.ArgumentTypeError(f"{text!r}: expected AR or AR,MA, such as 2,1")
+    return orders
+
+
+def _port(text: str) -> int:
+    """Return a port number, or 0 for any that is free."""
+    if not text.isdigit() or int(text) > 65535:
+        raise argparse.ArgumentTypeError(f"{text!r}: expected a port from 0 to 65535")
+    return int(text)
 
 
 def _identify(arguments: argparse.Namespace) -> None:
@@ -132,7 +165,7 @@ def _identify(arguments: argparse.Namespace) -> None:
     identify = importlib.import_module("nmss_lab.identify")
     record = _record(arguments)
     noise = identify.Noise(*arguments.noise) if arguments.noise else None
-    print(f"{len(record.time)} samples every {record.dt:g}", *record.notes, sep="; ")
+    print(f"{len(record.time)} samples every {record.dt:g} s", *record.notes, sep="; ")
     ranked = identify.order_search(
         record,
         arguments.na,
@@ -148,6 +181,7 @@ def _identify(arguments: argparse.Namespace) -> None:
     _print_estimate(best.estimate)
     if arguments.model:
         importlib.import_module("nmss_lab.files").save(arguments.model, best.estimate)
+        print(f"written: {arguments.model}")
 
 
 def _record(arguments: argparse.Namespace) -> Any:

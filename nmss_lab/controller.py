@@ -138,7 +138,7 @@ class Status(enum.IntEnum):
 _SENTENCES = {
     Status.FREE: "No limit is active: the linear law was applied.",
     Status.LIMITED: "A limit is active in the plan: the quadratic program was solved.",
-    Status.SOFTENED: "Output limits could not all be kept: they were relaxed.",
+    Status.SOFTENED: "Limits could not all be kept: some were relaxed.",
     Status.DROPPED: "Output limits could not be kept: they were dropped this sample.",
     Status.CLIPPED: "The law asked for more than the input can do: it was clipped.",
     Status.REFUSED: "A measurement was not a number: its prediction stood in for it.",
@@ -506,8 +506,8 @@ def signal(name: str, value: Array | None, size: int) -> Array:
 
 
 def _channels(name: str, value: Any, size: int) -> Array:
-    """Signals (..., size) as numbers."""
-    array = np.asarray(value, dtype=float)
+    """Signals (..., size) as numbers; a plain number is one channel."""
+    array = np.atleast_1d(np.asarray(value, dtype=float))
     if array.shape[-1:] != (size,):
         raise ValueError(f"{name} has shape {array.shape}, expected (..., {size})")
     return array

@@ -142,6 +142,8 @@ def governor(
         raise ValueError(f"free_until = {free_until}: expected 1 to Np = {Np} steps")
     if not 0.0 < decay <= 1.0:
         raise ValueError(f"decay = {decay}: expected 0 < decay <= 1")
+    if decay < 1.0:  # what has faded to a millionth no longer counts
+        free = min(free, 1 + int(np.log(1e-6) / np.log(decay)))
     if reference not in ("held", "preview"):
         raise ValueError(f'reference = "{reference}": expected "held" or "preview"')
     find_backend(backend)

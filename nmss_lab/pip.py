@@ -130,6 +130,13 @@ def lq_gain(model: DifferenceModel, Q: Any, R: Any) -> Array:
     """
     form = integral_of_error_form(model)
     Q, R = weight("Q", Q, 1, form.n_x), weight("R", R, 1, model.n_u)
+    for name, matrix, least in (("Q", Q, -1e-12), ("R", R, 1e-12)):
+        smallest = float(np.linalg.eigvalsh(matrix)[0])
+        if smallest < least * max(1.0, np.abs(matrix).max()):
+            wanted = "not be negative" if name == "Q" else "be positive"
+            raise ValueError(
+                f"{name} has the eigenvalue {smallest:.4g}; all of them must {wanted}"
+            )
     P = lq_cost(form.A, form.B, Q, R)
     K: Array = np.linalg.solve(R + form.B.T @ P @ form.B, form.B.T @ P @ form.A)
     return K

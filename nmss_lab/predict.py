@@ -185,6 +185,11 @@ class Horizon:
 
     def __post_init__(self) -> None:
         """Check the horizons and normalise the blocks."""
+        for name, value in (("Np", self.Np), ("Nc", self.Nc)):
+            if isinstance(value, bool) or not isinstance(value, int | np.integer):
+                raise ValueError(
+                    f"{name} = {value!r}: expected a whole number of samples"
+                )
         if not 1 <= self.Nc <= self.Np:
             raise ValueError(
                 f"Np = {self.Np}, Nc = {self.Nc}: expected 1 <= Nc <= Np samples"

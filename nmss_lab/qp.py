@@ -96,11 +96,11 @@ class QuadraticProgram:
     def free(self) -> Array:
         """Gain (n_z, n_theta) of the optimum without limits, -H^-1 f.
 
-        Equalities to zero always hold, so the optimum is taken among what meets them,
+        Terminal equalities always hold, so the optimum is taken among what meets them,
         unless they are more than the decision can meet.
         """
         free = -scipy.linalg.cho_solve(scipy.linalg.cho_factor(self.H), self.f)
-        equal = (self.lower == 0.0) & (self.upper == 0.0)
+        equal = self.rows.get("terminal", np.zeros(0, dtype=int))
         E, e = self.M[equal], self.offset[equal]
         if not 0 < len(E) <= self.n_z or np.linalg.matrix_rank(E) < len(E):
             return free
@@ -193,7 +193,8 @@ def assemble(
         raise ValueError(
             f"the {what} give a cost that is not convex: the smallest eigenvalue of "
             f"the condensed Hessian is {smallest:.4g} (largest {largest:.4g}). "
-            "Weigh the moves more, or correct an indefinite weighting block."
+            "Correct or weigh less a block that has negative eigenvalues itself; where "
+            "there is none, weigh the moves more."
         )
     rows = [_rows(limit) for limit in limits]
     none = np.zeros((0, table.shape[1] + 2))

@@ -359,6 +359,11 @@ def _lock_step(
     plants: _Single | _Stacked, controller: Controller, scenario: Scenario
 ) -> Iterator[Sample]:
     """Advance all loops by one sample at a time."""
+    if not isinstance(controller, Controller):
+        raise ValueError(
+            f"controller is a {type(controller).__name__}, expected a Controller; a "
+            "Design makes one with build()"
+        )
     model = controller.model
     _check_sizes(plants, controller)
     names = "input_disturbance", "output_disturbance", "noise", "manual"
@@ -377,6 +382,8 @@ def _lock_step(
     knows_v = model.n_v > 0
     for k in range(len(scenario)):
         y = plants.output(state) + d_y[k]
+        if not np.isfinite(y).all():
+            raise ValueError(f"the loop diverged: y is no longer finite at sample {k}")
         measured = y + noise[k]
         memory = controller.measure(memory, measured, r[k], v[k] if knows_v else None)
         move = controller.decide(
