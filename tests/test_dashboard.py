@@ -16,7 +16,7 @@ from playwright.sync_api import Browser, Page, expect
 
 from apps.pages import governor, receding_horizon
 from apps.pages.live import LivePage, Subject
-from apps.session import Choices, GovernorChoices, LoopChoices
+from apps.session import Choices, GovernorChoices, LoopChoices, plain
 from nmss_lab.measures import table
 from nmss_lab.plots import Chart, busiest_sample, draw, loop_charts, pack, sentences
 
@@ -450,6 +450,65 @@ def test_impossible_design_shows_a_message(visit: Open) -> None:
     slide(page, "Nc", "min")
     expect(alert).not_to_contain_text("Nc")
     assert page.locator(".text-measures table").inner_text() != before
+
+
+@pytest.mark.parametrize("subject", SUBJECTS, ids=PAGES)
+def test_curves_are_those_of_the_runs_after_a_change(
+    visit: Open, subject: Subject
+) -> None:
+    """What Bokeh draws after a slider has moved is what the library computes."""
+    page = visit(f"{PAGES[SUBJECTS.index(subject)]}?{QUICK}")
+    slide(page, "gain", "max")
+    choices = subject.choices(case="governor_3_4")
+    choices.accept({"gain": choices.param["gain"].bounds[1]})
+    named = {plain(name): run for name, run in choices.runs().items()}
+    picture = pack(subject.charts(named, 0, 0))
+    for chart in picture["charts"]:
+        drawn = page.evaluate(
+            "(name) => { const plot = Bokeh.documents[0].get_model_by_name(name);"
+            " return plot.renderers.map(({ name, data_source: { data } }) =>"
+            " [name, Array.from(data.t), Array.from(data.y)]) }",
+            chart["name"],
+        )
+        curves = {name: (t, y) for name, t, y in drawn}
+        for line in chart["lines"]:
+            start, size = line["start"], line["size"]
+            for values in curves[line["name"]]:
+                expected = picture["data"][start : start + size]
+                assert values == pytest.approx(expected.tolist()), chart["name"]
+                start += size
+
+
+def test_choice_made_while_a_case_is_on_its_way(visit: Open) -> None:
+    """It stays where its control is the same; the old case's values never follow."""
+    page = visit("receding_horizon?case=measured_disturbance_7_4_1")
+    settled(page)
+    page.evaluate(
+        "() => { const root = document.querySelectorAll('*');"
+        " const deep = (name) => { for (const e of [...root]) {"
+        " const found = e.shadowRoot?.querySelector(`[name=${name}]`);"
+        " if (found) return found } };"
+        " const find = (n) => document.querySelector(`[name=${n}]`) ?? deep(n);"
+        " const box = find('case'); box.value = '\"governor_3_4\"';"
+        " box.dispatchEvent(new Event('change', { bubbles: true }));"
+        " const gain = find('gain'); gain.value = gain.max;"
+        " gain.dispatchEvent(new Event('input', { bubbles: true })) }"
+    )
+    settled(page)
+    expect(page.locator(".wrong")).to_have_count(0)
+    expect(page.locator("select[name=case]")).to_have_value('"governor_3_4"')
+    gain = page.locator("input[name=gain]")
+    assert gain.input_value() == gain.get_attribute("max")
+    page.wait_for_timeout(400)  # the address is written a quarter of a second later
+    assert "disturbance_direct" not in page.url
+
+
+@pytest.mark.parametrize("chosen", ["foo", "wang_young,foo"])
+def test_link_with_an_unknown_structure_is_explained(visit: Open, chosen: str) -> None:
+    """The page opens on the case as it is, and says which name is wrong."""
+    page = visit(f"receding_horizon?structures={chosen}")
+    expect(page.get_by_role("alert")).to_contain_text("foo")
+    expect(page.locator(".text-measures tbody tr")).to_have_count(2)
 
 
 def test_case_changes_form_and_plots(visit: Open) -> None:
