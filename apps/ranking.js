@@ -88,7 +88,8 @@ export function render({ model, el }) {
       const row = model.rows.find((one) => one.id === id)
       return element("div", {}, element("span", { class: `swatch style${place}` }),
         element("b", {}, row?.orders ?? ""),
-        button("Control it: Receding horizon", () => tell({ act: "send", id })),
+        button("Control it: Receding horizon", () => tell({ act: "control", id })),
+        button("Govern it: Reference governor", () => tell({ act: "govern", id })),
         button("Save as JSON", () => tell({ act: "save", id })))
     }))
   }

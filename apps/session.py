@@ -720,6 +720,14 @@ class GovernorChoices(Choices):
     def _main_design(self) -> Design:
         return known_case(self.case).designs["governor"]
 
+    def _welcome(self, name: str) -> None:
+        if name in KEPT and "governor" not in KEPT[name].designs:
+            raise ValueError(
+                f"case = {name!r}: no stabilising gain was found for this model, so "
+                "there is nothing to govern"
+            )
+        super()._welcome(name)
+
     def take_case(self, name: str) -> None:
         """Choose a case and the governor's horizon."""
         super().take_case(name)

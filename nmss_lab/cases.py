@@ -1021,7 +1021,11 @@ def model_case(
         section="",
         source="Identified from a record",
         plant=model.plant(),
-        designs={**predictive(design, *names), "integral_of_error": integral},
+        designs={
+            **predictive(design, *names),
+            "integral_of_error": integral,
+            **_governed(integral, gains, min(Np, 40)),
+        },
         scenario=_trial(model, Np, gains),
         notes=(
             "The plant is the model itself; change its gain or dynamics to see what "
@@ -1034,11 +1038,28 @@ def model_case(
     )
 
 
+def _governed(design: Design, gains: Array, Np: int) -> dict[str, Design]:
+    """Gain of the design's weights, alone and governed; nothing where there is none."""
+    model = design.model
+    try:
+        K = lq_gain(model, design.Q, design.R)
+    except ValueError:
+        return {}
+    # a little more than the reference of 1 needs
+    most = 1.2 / np.maximum(gains, 1e-3 * gains.max())
+    limits = Limits(u=(-most, most))
+    pip = Design("pip", model, limits=limits, options={"K": K})
+    governor = dataclasses.replace(pip, structure="governor", horizon=Horizon(Np, Np))
+    return {"pip": pip, "governor": governor}
+
+
 def _trial(model: DifferenceModel, Np: int, gains: Array) -> Scenario:
     """Step of the reference, then of what acts at the input, then of what is seen."""
     first, samples = 5, 5 + 4 * Np
     change = np.zeros(model.n_u)
-    change[gains.argmax()] = 0.5 / gains.max()
+    strongest = gains.argmax()
+    # towards the reference, so that inputs which reach it do with less afterwards
+    change[strongest] = 0.5 / model.steady_state_gain()[0, strongest]
     at = first + 3 * Np // 2
     seen = piecewise(samples, (first + 3 * Np, np.ones(model.n_v)))
     return Scenario(

@@ -371,11 +371,17 @@ def test_each_record_from_data_to_controller(visit: Open, server: Server) -> Non
     saved = load(got.value.path())
     assert str(saved.orders) == best
     assert saved.covariance.shape == (saved.orders.count,) * 2
+    expect(page.get_by_role("button", name="Govern it")).to_have_count(1)
     page.get_by_role("button", name="Control it").click()
     page.wait_for_function("window.nmssPlayer?.frames > 0", timeout=60_000)
     assert page.url.startswith(f"{server.url}receding_horizon?case=model-")
     chosen = page.locator("select[name=case] option:checked")
     expect(chosen).to_contain_text("Your model of")
+    expect(page.locator(".text-measures tbody tr")).to_have_count(2)
+    expect(page.locator(".wrong")).to_have_count(0)
+    page.goto(page.url.replace("receding_horizon", "governor"))
+    page.wait_for_function("window.nmssPlayer?.frames > 0", timeout=60_000)
+    expect(page.locator("select[name=case] option:checked")).to_contain_text("Your")
     expect(page.locator(".text-measures tbody tr")).to_have_count(2)
     expect(page.locator(".wrong")).to_have_count(0)
     assert "Traceback" not in server.log.read_text()

@@ -229,7 +229,7 @@ class IdentifyPage:
             self.stop.set()
         elif act == "choose":
             self._choose(sent.get("chosen", []))
-        elif act in ("send", "save"):
+        elif act in ("control", "govern", "save"):
             self._guard(lambda: self._give(act, sent.get("id")), sent)
             self._tell()
 
@@ -329,7 +329,7 @@ class IdentifyPage:
         self._show()
 
     def _give(self, act: str, which: Any) -> None:
-        """Send a model to the other page, or to the browser as a file."""
+        """Send a model to another page, or to the browser as a file."""
         if which not in self.chosen:
             raise ValueError("choose a row of the ranking first")
         found = self.found[which].estimate
@@ -340,7 +340,8 @@ class IdentifyPage:
             self.ranking.saved = {"name": "model.json", "text": text, "number": number}
         else:
             number = self.ranking.leads.get("number", 0) + 1
-            to = f"receding_horizon?case={keep_model(found)}"
+            page = {"control": "receding_horizon", "govern": "governor"}[act]
+            to = f"{page}?case={keep_model(found)}"
             self.ranking.leads = {"to": to, "number": number}
 
     def _forget(self) -> None:
