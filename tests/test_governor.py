@@ -176,3 +176,13 @@ def test_mistakes_are_refused(arguments, message):
     options = {"K": K, **arguments}
     with pytest.raises(ValueError, match=message):
         governor(MODEL, options.pop("K"), 10, LIMITS, **options)
+
+
+def test_perturbations_that_fade_at_once_leave_a_sound_program():
+    """Columns that fade to nothing are left out, so the solver is not led astray."""
+    model = DifferenceModel([-1.7, 1.0], [-1.0, 2.0])
+    K = pole_gain(model, [0.0, 0.0, 0.2, 0.2])
+    made = governor(model, K, 80, Limits(u=(-2, 2), du=(-0.5, 0.5)), decay=0.05)
+    assert made.n_z == 5  # 0.05 ** 4 is still above a millionth
+    run = closed_loop(model, made, Scenario(np.repeat([0.0, 3.0], 30)))
+    assert not np.isin(run.status, [Status.SHIFTED, Status.HELD]).any()

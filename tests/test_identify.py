@@ -983,3 +983,20 @@ def test_command_names_what_is_wrong(text, message, tmp_path, capsys):
     columns = ["--inputs", "u", "--output", "y", "--time", "t"]
     assert main(["identify", str(data), *columns]) == 1
     assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (["--na", "3-1"], "expected numbers such as 1-3"),
+        (["--nk", "x"], "expected numbers such as 1-3"),
+        (["--noise", "2-4"], "expected AR or AR,MA"),
+        (["--noise", "2,1,3"], "expected AR or AR,MA"),
+    ],
+)
+def test_command_says_how_orders_are_written(given, message, capsys):
+    """A mistake on the command line ends in a sentence, not in a traceback."""
+    with pytest.raises(SystemExit) as left:
+        main(["identify", "a.csv", "--inputs", "u", "--output", "y", *given])
+    assert left.value.code == 2
+    assert message in capsys.readouterr().err

@@ -210,3 +210,13 @@ def test_unused_gains_are_the_same_for_one_row_or_a_matrix():
     """A single input may have its gain as a vector."""
     a, b = pip(MODEL, K[0]), pip(MODEL, K)
     assert relative(a.K, b.K) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("Q", "R", "message"),
+    [(-1.0, 1.0, "Q has the eigenvalue -1"), (1.0, -1.0, "R has the eigenvalue -1")],
+)
+def test_negative_weights_are_refused(Q, R, message):
+    """A Riccati solver may well return a gain for them."""
+    with pytest.raises(ValueError, match=message):
+        lq_gain(DifferenceModel([-0.9], [0.0, 0.2]), Q, R)

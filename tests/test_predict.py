@@ -363,3 +363,10 @@ def test_next_state_predicts_the_next_state(rng, sizes):
     y = roll_out(model, h.y, h.u, [], [u], quiet)[0]
     after = c.form.A @ x + c.form.B @ u + c.form.D @ r
     assert relative(c.form.C @ after, y) <= ALGEBRA
+
+
+@pytest.mark.parametrize("sizes", [(2.5, 1), ("3", 1), (3, None), (True, True)])
+def test_horizons_are_whole_numbers(sizes):
+    """The argument is named, not a step of the construction."""
+    with pytest.raises(ValueError, match=r"N[pc] = .*: expected a whole number"):
+        Horizon(*sizes)

@@ -9,6 +9,7 @@ from strategies import random_model, roll_out
 
 from nmss_lab import qp
 from nmss_lab.controller import Limits, Status
+from nmss_lab.design import Design
 from nmss_lab.governor import governor
 from nmss_lab.models import DifferenceModel
 from nmss_lab.mpc import STRUCTURES, integral_of_error, wang_young
@@ -641,3 +642,38 @@ def test_integral_of_error_alone_holds_its_sum(rng):
         total += 0.5 - sample.measured[0]
         held = layout.read(sample.memory.vector, "integral")[0]
         assert held == pytest.approx(total, abs=REPLAY)
+
+
+def test_design_in_place_of_a_controller_is_explained():
+    """What is easily mistaken for each other."""
+    design = Design("wang_young", MODEL)
+    with pytest.raises(ValueError, match=r"Design, expected a Controller.*build\(\)"):
+        closed_loop(MODEL, design, Scenario(np.ones(3)))
+
+
+def test_loop_that_diverges_says_when():
+    """An unstable plant that its limits cannot hold ends in a message, not in NaN."""
+    wild = DifferenceModel([-3.0], [1.0])
+    controller = wang_young(wild, Horizon(5, 2), 1.0, 1.0, Limits(u=(-1, 1)))
+    scenario = Scenario(np.zeros(1000), output_disturbance=np.full(1000, 5.0))
+    with (
+        np.errstate(over="ignore", invalid="ignore"),
+        pytest.raises(ValueError, match="diverged: y is no longer finite at sample"),
+    ):
+        closed_loop(wild, controller, scenario)
+
+
+def test_input_pinned_at_zero_is_a_limit():
+    """Sides that coincide at zero hold, and the moves say so."""
+    controller = wang_young(MODEL, Horizon(5, 2), 1, 1, Limits(du=(0, 0)))
+    run = closed_loop(MODEL, controller, Scenario(np.ones(6), v=np.zeros(6)))
+    assert np.abs(run.u).max() < DECISION
+    assert (run.status == Status.LIMITED).any()
+
+
+def test_plain_number_is_one_channel():
+    """A single measurement needs no brackets."""
+    controller = build("wang_young")
+    memory = controller.measure(controller.start(), 0.5, 1.0, 0.0)
+    same = controller.measure(controller.start(), [0.5], [1.0], [0.0])
+    assert np.array_equal(memory.vector, same.vector)
