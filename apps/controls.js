@@ -16,6 +16,8 @@ export function render({ model, el }) {
   let changed = false  // whether values changed since it was sent
   let touched = {}     // and which
   let items = {}       // description of each control, as text
+  const typing = {}    // text of number fields that is not entered yet
+  let building = false
   let sent = 0
   let address = 0
   let painted = () => {}
@@ -106,11 +108,21 @@ export function render({ model, el }) {
       type: "number", id, name: item.name, "aria-describedby": id + "-help",
       min: item.low, max: item.high, step: "any",
     })
-    update[item.name] = (value) => { input.value = Number(value.toPrecision(8)) }
-    input.addEventListener("change", () => {
+    // What is being typed stays, whatever arrives meanwhile
+    update[item.name] = (value) => {
+      if (!(item.name in typing)) input.value = Number(value.toPrecision(8))
+    }
+    if (item.name in typing) input.value = typing[item.name]
+    input.addEventListener("input", () => { typing[item.name] = input.value })
+    const enter = () => {
+      if (building || !(item.name in typing)) return
+      delete typing[item.name]
       if (input.value !== "") choose(item.name, Number(input.value))
       else update[item.name](values[item.name])
-    })
+    }
+    // A field that was made anew while somebody typed tells of no change when left
+    input.addEventListener("change", enter)
+    input.addEventListener("blur", enter)
     return [element("label", { for: id }, item.label), input]
   }
 
@@ -144,7 +156,9 @@ export function render({ model, el }) {
     for (const part of form.querySelectorAll("details")) {
       open[part.dataset.title] = part.open
     }
+    building = true  // a field that is taken away is left, but not entered
     form.replaceChildren()
+    building = false
     for (const name of Object.keys(update)) delete update[name]
     items = {}
     for (const [number, group] of model.form.groups.entries()) {
