@@ -441,10 +441,15 @@ class Controller(ABC):
         Zero while the decided input is applied; else the way from what the law without
         limits asks for to the applied input, so that nothing winds up.
         """
-        size = 1e-9 * (1.0 + np.abs(u).max(axis=-1, keepdims=True))
-        other = np.abs(u - move.u).max(axis=-1, keepdims=True) > size
         r = np.tile(self.form.recipe.layout.read(memory.vector, "r"), 1 + self.preview)
-        return np.where(other, u - self._free_move(memory.vector, r), 0.0)
+        free = self._free_move(memory.vector, r)
+        return np.where(self._overruled(u, free, move), u - free, 0.0)
+
+    def _overruled(self, u: Array, free: Array, move: Move) -> Array:
+        """Whether another input was applied than was decided, (..., 1)."""
+        size = 1e-9 * (1.0 + np.abs(u).max(axis=-1, keepdims=True))
+        other: Array = np.abs(u - move.u).max(axis=-1, keepdims=True) > size
+        return other
 
     def clip(self, u: Array, before: Array) -> Array:
         """Nearest input within the limits, given the one before.

@@ -32,6 +32,7 @@ from nmss_lab.predict import (
     difference,
     known_part,
     predict,
+    stack,
 )
 from nmss_lab.predictive import (
     Forecast,
@@ -357,11 +358,7 @@ class _Setup:
 
     def stacked_reference(self) -> Affine:
         """S as one signal of Np n_y rows."""
-        steps = self.reference
-        return Affine(
-            np.concatenate([s.gain for s in steps]),
-            np.concatenate([s.known for s in steps]),
-        )
+        return stack(self.reference)
 
     def disturbances(self) -> list[Affine]:
         """Offsets G delta_{k+i} of each step of the horizon, n_x rows each."""
@@ -438,10 +435,7 @@ class _Setup:
         inputs = min(model.nb - 1, Np) * model.n_u
         error = (Y - self.stacked_reference())[slice(Np * model.n_y - outputs, None)]
         still = dU[slice(Np * model.n_u - inputs, None)]
-        signal = Affine(
-            np.concatenate([error.gain, still.gain]),
-            np.concatenate([error.known, still.known]),
-        )
+        signal = stack([error, still])
         zero = np.zeros(len(signal))
         return Limit("terminal", signal, zero, zero, 1, np.full(len(signal), Np - 1))
 

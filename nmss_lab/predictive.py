@@ -137,18 +137,17 @@ class PredictiveController(Controller):
         step = np.minimum(np.arange(self.horizon.Np) + shift, self.horizon.Np - 1)
         return np.take_along_axis(plan, step[..., None], axis=-2)
 
-    def _missed(self, memory: Memory, u: Array, move: Move) -> Array:
-        """As ``Controller._missed``, and where a level limit holds the input."""
-        missed = super()._missed(memory, u, move)
+    def _overruled(self, u: Array, free: Array, move: Move) -> Array:
+        """As for any controller, and where a level limit holds the input, (..., 1)."""
+        other = super()._overruled(u, free, move)
         if not self.anti_windup:
-            return missed
-        r = np.tile(self.form.recipe.layout.read(memory.vector, "r"), 1 + self.preview)
-        free = self._free_move(memory.vector, r)
+            return other
         low, high = self.limits_u
         held: Array = ((free > high) & np.isclose(u, high)) | (
             (free < low) & np.isclose(u, low)
         )
-        return np.where(held.any(axis=-1, keepdims=True), u - free, missed)
+        overruled: Array = other | held.any(axis=-1, keepdims=True)
+        return overruled
 
     def _decide(self, memory: Memory, r: Array, v: Array) -> Move:
         theta = self._known(memory.vector, r, v)
