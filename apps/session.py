@@ -16,7 +16,7 @@ from typing import Any, ClassVar
 import numpy as np
 import param
 
-from nmss_lab.cases import CASES, Case, case, model_case, piecewise
+from nmss_lab.cases import LINEAR_CASES, Case, case, model_case, piecewise
 from nmss_lab.controller import Limits
 from nmss_lab.design import Design
 from nmss_lab.files import dumps
@@ -263,7 +263,7 @@ class Choices(Form):
     @classmethod
     def cases(cls) -> list[str]:
         """Cases that this page can show."""
-        return list(CASES)
+        return list(LINEAR_CASES)
 
     @property
     def example(self) -> Case:
@@ -714,7 +714,8 @@ class GovernorChoices(Choices):
     @functools.cache
     def cases(cls) -> list[str]:
         """Cases with a governor and with the same gain alone."""
-        return [n for n in CASES if {"governor", "pip"} <= set(known_case(n).designs)]
+        both = {"governor", "pip"}
+        return [n for n in LINEAR_CASES if both <= set(known_case(n).designs)]
 
     @property
     def _main_design(self) -> Design:

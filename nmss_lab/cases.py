@@ -22,7 +22,9 @@ from nmss_lab.models import Array, DifferenceModel, LinearPlant
 from nmss_lab.mpc import state_weight
 from nmss_lab.pip import lq_gain, pole_gain
 from nmss_lab.predict import Horizon
+from nmss_lab.sdp_mpc import Settling
 from nmss_lab.simulate import Scenario
+from nmss_lab.state_dependent import StateDependentModel, StateDependentPlant
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +38,7 @@ class Case:
         Section of the thesis, or of the source.
     source : str
         Where the numbers come from.
-    plant : LinearPlant
+    plant : LinearPlant or StateDependentPlant
         Sampled plant; with outputs between the samples if it comes from continuous
         time.
     designs : mapping of str to Design
@@ -57,7 +59,7 @@ class Case:
     title: str
     section: str
     source: str
-    plant: LinearPlant
+    plant: LinearPlant | StateDependentPlant
     designs: Mapping[str, Design]
     scenario: Scenario
     notes: tuple[str, ...]
@@ -67,8 +69,15 @@ class Case:
 
     @property
     def model(self) -> DifferenceModel:
-        """Model of the first design."""
-        return next(iter(self.designs.values())).model
+        """Model of the first design; of a state-dependent one, sizes and names."""
+        model = next(iter(self.designs.values())).model
+        return model.wide if isinstance(model, StateDependentModel) else model
+
+    @property
+    def equation(self) -> StateDependentModel | None:
+        """State-dependent model of the first design, if it is one."""
+        model = next(iter(self.designs.values())).model
+        return model if isinstance(model, StateDependentModel) else None
 
 
 def case(name: str) -> Case:
@@ -1041,6 +1050,7 @@ def model_case(
 def _governed(design: Design, gains: Array, Np: int) -> dict[str, Design]:
     """Gain of the design's weights, alone and governed; nothing where there is none."""
     model = design.model
+    assert isinstance(model, DifferenceModel)
     try:
         K = lq_gain(model, design.Q, design.R)
     except ValueError:
@@ -1069,7 +1079,205 @@ def _trial(model: DifferenceModel, Np: int, gains: Array) -> Scenario:
     )
 
 
-CASES: dict[str, Callable[[], Case]] = {
+# Chapter 8, and plants of its kind
+
+
+DEADBEAT = {"poles": (0.0, 0.0)}
+
+
+def bilinear_8_5_1() -> Case:
+    """Deadbeat PIP control of a bilinear plant, with and without a governor."""
+    model = StateDependentModel([-0.7], ["y[k-2]"])
+    limits = Limits(u=(-0.5, 0.5))
+    pip = Design("sdp_pip", model, limits=limits, options=DEADBEAT)
+    governed = dataclasses.replace(
+        pip, structure="sdp_governor", horizon=Horizon(3, 3), reference="preview"
+    )
+    naive = dataclasses.replace(pip, options={**DEADBEAT, "law": "incremental"})
+    mpc = Design("sdp_increments", model, Horizon(10, 4), 1.0, 0.1, limits)
+    return Case(
+        name="bilinear_8_5_1",
+        title="Bilinear plant, deadbeat PIP control and a governor",
+        section="8.5.1",
+        source="Plant (8.11), poles and limit of section 8.5.1",
+        plant=model.plant(),
+        designs={
+            "sdp_governor": governed,
+            "sdp_pip": pip,
+            "sdp_pip_naive": naive,
+            **_schemes(mpc),
+        },
+        scenario=Scenario(piecewise(40, (0, 1.0), (3, 2.0)), y0=1.0, u0=0.3),
+        notes=(
+            "It starts at rest with the sum of the error that holds u = 0.3; the "
+            "printed z = 0 is a transient in which y comes to 0 and the gain is "
+            "lost.",
+            "The governor reads the reference one sample ahead, as printed in (3.12).",
+            "sdp_pip_naive sums changes of the input weighed with gains that vary, "
+            "(3.13) taken literally: another law, and the one that overshoots.",
+            "The predictive designs, not part of this section, are our choice.",
+        ),
+    )
+
+
+def product_8_5_2() -> Case:
+    """Predictive control of a plant that multiplies its last two inputs."""
+    model = StateDependentModel([-0.7], ["u[k-2]"])
+    levels = Design(
+        "sdp_integral_of_error",
+        model,
+        Horizon(10, 8),
+        (3.0, 0.1),
+        1.0,
+        Limits(u=(-1.0, 1.0), du=(-0.2, 0.2)),
+        options=AS_PRINTED,
+    )
+    moves = Design(
+        "sdp_increments",
+        model,
+        Horizon(10, 8),
+        0.1,
+        1.0,
+        Limits(u=(-0.82, 0.82), du=(-0.15, 0.15)),
+        options={"offset_free": False},
+    )
+    return Case(
+        name="product_8_5_2",
+        title="Product of two inputs, predictive control in both forms",
+        section="8.5.2",
+        source="Plant, weights, horizons and limits of section 8.5.2",
+        plant=model.plant(),
+        designs={**_schemes(moves), **_schemes(levels, "integral_")},
+        scenario=Scenario(
+            piecewise(41, (0, 1.0), (5, 2.0)),
+            manual=np.where(np.arange(41) < 1, 0.547, np.nan),
+            y0=1.0,
+            u0=0.547,
+            z0=0.0,
+        ),
+        notes=(
+            "u_0 = 0.547 is applied by hand and the controller acts from k = 1; the "
+            "exact rest would be u = sqrt(0.3) = 0.54772, and with an integral "
+            "z = 2.1556: the printed start is a transient.",
+            "The reference is not previewed: the horizon repeats r_k.",
+            "Predictions are made as printed, without the last miss of the equation; "
+            "the sum of the error is not corrected at limits.",
+            "Names say the scheme; those with integral_ weigh the sum of the error "
+            "(8.3), the others changes of the input (8.4).",
+            "Negative inputs do the same: the plant cannot tell u from -u.",
+        ),
+    )
+
+
+def conical_tank() -> Case:
+    """Level of a conical tank: fast and sensitive when low, slow when high."""
+    model = StateDependentModel(
+        a=["dt*out/(area*y[k-1]**2*sqrt(y[k-1])) - 1"],
+        b=["dt/(area*y[k-1]**2)"],
+        dt=5.0,
+        y_names=["level"],
+        u_names=["inflow"],
+        units={"level": "cm", "inflow": "cm3/s"},
+        constants={"dt": 5.0, "area": float(np.pi * 0.25), "out": 60.0},
+    )
+    limits = Limits(u=(0.0, 800.0), du=(-60.0, 60.0), y=(12.0, 75.0), outputs="soft")
+    design = Design("sdp_increments", model, Horizon(20, 5), 1.0, 1e-3, limits)
+    start = 20.0
+    steps = (0, start), (5, 40.0), (60, 60.0), (120, 18.0)
+    return Case(
+        name="conical_tank",
+        title="Conical tank",
+        section="",
+        source="Synthetic: cone of half the radius per height, outflow 60 sqrt(level)",
+        plant=model.plant(),
+        designs=_schemes(design),
+        scenario=Scenario(
+            piecewise(180, *steps), y0=start, u0=60.0 * float(np.sqrt(start))
+        ),
+        notes=(
+            "Balance of volume, stepped explicitly every 5 s: area * level^2 times "
+            "the change of the level is inflow minus 60 sqrt(level).",
+            "The area of the surface grows with the square of the level, so at 20 cm "
+            "the tank is nine times as fast as at 60 cm.",
+        ),
+    )
+
+
+def stirred_reactor() -> Case:
+    """Exothermic reactor held at a temperature at which it would run away."""
+    rate = "rate*exp(-E/T[k-1])"
+    burnt = f"(1 + h*feed/c[k-1])/(1 + h*(1 + {rate}))"
+    model = StateDependentModel(
+        a=[
+            [
+                [f"-{burnt}", 0.0],
+                [f"-h*heat*{rate}*{burnt}/w", "-(1 + h*warm/T[k-1])/w"],
+            ]
+        ],
+        b=[[[0.0], ["h*jacket/w"]]],
+        dt=3.0,
+        y_names=["c", "T"],
+        u_names=["coolant"],
+        units={"c": "mol/L", "T": "K", "coolant": "K"},
+        constants={
+            "h": 0.05,
+            "rate": 7.2e10,
+            "E": 8750.0,
+            "feed": 1.0,
+            "warm": 350.0,
+            "heat": 5e4 / 239.0,
+            "jacket": 5e4 / (100.0 * 239.0),
+            "w": 1.0 + 0.05 * (1.0 + 5e4 / (100.0 * 239.0)),
+        },
+    )
+    limits = Limits(u=(280.0, 320.0), du=(-2.0, 2.0))
+    design = Design("sdp_increments", model, Horizon(16, 6), (0.0, 1.0), 0.2, limits)
+
+    def rest(temperature: float) -> tuple[float, float]:
+        rate = 7.2e10 * np.exp(-8750.0 / temperature)
+        return float(1.0 / (1.0 + rate)), temperature
+
+    steps = (0, rest(350.0)), (5, rest(360.0)), (60, rest(340.0))
+    c, T = rest(350.0)
+    made = 5e4 / 239.0 * (1.0 - c)
+    cool = T - (350.0 - T + made) / (5e4 / (100.0 * 239.0))
+    return Case(
+        name="stirred_reactor",
+        title="Stirred tank reactor at an unstable temperature",
+        section="",
+        source="The exothermic A to B reactor of textbooks: q/V = 1/min, k0 = 7.2e10/"
+        "min, E/R = 8750 K, -dH = 5e4 J/mol, rho cp = 239 J/(L K), UA = 5e4 J/(min K)",
+        plant=model.plant(),
+        designs=_schemes(design),
+        scenario=Scenario(piecewise(120, *steps), y0=np.array([c, T]), u0=cool),
+        notes=(
+            "Balances of mass and heat, stepped every 0.05 min, implicitly where they "
+            "are linear; constant terms are carried by 1/c and 1/T.",
+            "Only the temperature is weighed; the reference of the concentration is "
+            "where it comes to rest.",
+            "At 350 K the reactor is unstable: without control it cools down or runs "
+            "away.",
+        ),
+    )
+
+
+def _schemes(design: Design, prefix: str = "") -> dict[str, Design]:
+    """Design with each way to settle plan and predictions."""
+    settlings = {
+        "frozen": Settling("frozen"),
+        "iterated": Settling("iterated"),
+        "gauss_newton": Settling("gauss-newton"),
+        "newton": Settling("newton"),
+    }
+    return {
+        prefix + name: dataclasses.replace(
+            design, options={**design.options, "settling": settling}
+        )
+        for name, settling in settlings.items()
+    }
+
+
+LINEAR_CASES: dict[str, Callable[[], Case]] = {
     "governor_3_4": governor_3_4,
     "double_integrator_4_4_1": double_integrator_4_4_1,
     "ifac93_4_4_2": ifac93_4_4_2,
@@ -1083,4 +1291,15 @@ CASES: dict[str, Callable[[], Case]] = {
     "quadruple_tank_plus": quadruple_tank_plus,
     "wood_berry": wood_berry,
 }
+"""Cases of difference equations with constant coefficients."""
+
+VARYING_CASES: dict[str, Callable[[], Case]] = {
+    "bilinear_8_5_1": bilinear_8_5_1,
+    "product_8_5_2": product_8_5_2,
+    "conical_tank": conical_tank,
+    "stirred_reactor": stirred_reactor,
+}
+"""Cases of state-dependent plants."""
+
+CASES = {**LINEAR_CASES, **VARYING_CASES}
 """Functions that build the cases, by name."""

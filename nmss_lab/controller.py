@@ -118,7 +118,10 @@ class Limits:
 
 
 class Status(enum.IntEnum):
-    """How a move came about; ``sentence`` says it in words.  Higher is worse."""
+    """How a move came about; ``sentence`` says it in words.
+
+    Up to 7 higher is worse; from 8 on are those of plants whose parameters vary.
+    """
 
     FREE = 0
     LIMITED = 1
@@ -128,6 +131,12 @@ class Status(enum.IntEnum):
     REFUSED = 5
     SHIFTED = 6
     HELD = 7
+    AMBIGUOUS = 8
+    UNSETTLED = 9
+    OUT_OF_TIME = 10
+    CYCLED = 11
+    DIVERGED = 12
+    GUARDED = 13
 
     @property
     def sentence(self) -> str:
@@ -144,6 +153,15 @@ _SENTENCES = {
     Status.REFUSED: "A measurement was not a number: its prediction stood in for it.",
     Status.SHIFTED: "The solver failed: the last plan was continued and clipped.",
     Status.HELD: "There was no plan worth continuing: the last input was held.",
+    Status.AMBIGUOUS: "A plan of the opposite sign costs the same: one was chosen.",
+    Status.UNSETTLED: "Passes ran out before the predictions settled: the best plan so "
+    "far was applied.",
+    Status.OUT_OF_TIME: "Time ran out before the predictions settled: the best plan so "
+    "far was applied.",
+    Status.CYCLED: "The predictions swing between two plans: the better one was "
+    "applied.",
+    Status.DIVERGED: "The predictions ran away: the best plan so far was applied.",
+    Status.GUARDED: "The input has next to no effect here: it was held.",
 }
 
 
@@ -296,11 +314,12 @@ class Controller(ABC):
         u0: Array | None = None,
         v0: Array | None = None,
         r0: Array | None = None,
+        z0: Array | None = None,
     ) -> Memory:
         """Memory for a past in which y, u and v were constant (zero by default).
 
         With a past that is not zero, the sum of the error is chosen so that the law
-        asks for u0: switching on is bumpless.
+        asks for u0: switching on is bumpless; ``z0`` (n_y,) sets it instead.
 
         Raises
         ------
@@ -321,13 +340,23 @@ class Controller(ABC):
         vector = layout.pack(**parts)
         if "estimate" in layout:
             vector[layout["estimate"]] = self._estimate_at_rest(y)
-        if "integral" in layout and (np.any(y) or np.any(u)):
-            asked = self._free_move(vector, np.tile(y, 1 + self.preview))
-            vector = self._tracked(vector, u - asked)
+        if "integral" in layout and z0 is not None:
+            vector[layout["integral"]] = signal("z0", z0, model.n_y)
+        elif "integral" in layout and (np.any(y) or np.any(u)):
+            vector = self._balanced(vector, y, u)
             if "w" in layout:  # measuring takes y off, and w is added on applying
                 vector[layout["integral"]] += y
+        return self._fresh(vector)
+
+    def _fresh(self, vector: Array) -> Memory:
+        """Memory without a plan."""
         empty = np.zeros(self.n_z), np.zeros(self.n_theta), np.zeros(self.n_rows)
         return Memory(vector, *empty, np.array(-1), np.array(False))
+
+    def _balanced(self, vector: Array, y: Array, u: Array) -> Array:
+        """Memory at rest at y whose sum of the error makes the law ask for u."""
+        asked = self._free_move(vector, np.tile(y, 1 + self.preview))
+        return self._tracked(vector, u - asked)
 
     def measure(
         self, memory: Memory, y: Array, r: Array, v: Array | None = None
@@ -351,7 +380,7 @@ class Controller(ABC):
         v = _channels("v", v, model.n_v)
         good = np.isfinite(y).all(axis=-1) & np.isfinite(v).all(axis=-1)
         if not np.all(good):
-            y = np.where(np.isfinite(y), y, before @ recipe.forecast.T)
+            y = np.where(np.isfinite(y), y, self._expected(before))
             v = np.where(np.isfinite(v), v, layout.read(before, "v")[..., 0, :])
         r = np.broadcast_to(r, y.shape)
         now = np.concatenate(
@@ -359,6 +388,11 @@ class Controller(ABC):
         )
         vector = before @ recipe.carry.T + now @ recipe.enter.T
         return dataclasses.replace(memory, vector=vector, refused=~np.asarray(good))
+
+    def _expected(self, vector: Array) -> Array:
+        """y_k (..., n_y) that the model expects, from the memory before measuring."""
+        expected: Array = vector @ self.form.recipe.forecast.T
+        return expected
 
     def decide(
         self, memory: Memory, r: Array | None = None, v: Array | None = None
@@ -423,7 +457,7 @@ class Controller(ABC):
             raise ValueError(f"u = {u}, seen as {seen}, is not finite")
         vector = memory.vector
         if "integral" in layout:
-            vector = self._tracked(vector, self._missed(memory, u, move))
+            vector = self._followed(memory, u, move)
         applied = np.concatenate([u, seen, move.governed], axis=-1)
         vector = vector @ recipe.keep.T + applied @ recipe.store.T
         return Memory(
@@ -434,6 +468,10 @@ class Controller(ABC):
             move.shift,
             memory.refused,
         )
+
+    def _followed(self, memory: Memory, u: Array, move: Move) -> Array:
+        """Memory vector whose sum of the error fits the applied input."""
+        return self._tracked(memory.vector, self._missed(memory, u, move))
 
     def _missed(self, memory: Memory, u: Array, move: Move) -> Array:
         """By how much the sum of the error must move the law, (..., n_u).

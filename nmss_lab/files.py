@@ -22,7 +22,9 @@ from nmss_lab.identify import Estimate, Noise, Orders
 from nmss_lab.models import Array, Between, DifferenceModel, LinearPlant
 from nmss_lab.predict import Horizon
 from nmss_lab.records import Record
+from nmss_lab.sdp_mpc import Settling
 from nmss_lab.simulate import Run, Scenario
+from nmss_lab.state_dependent import StateDependentModel, StateDependentPlant
 
 SCHEMA = 1
 """Version of the file's layout; files of lower versions open as well."""
@@ -35,14 +37,21 @@ class Study:
     Parameters
     ----------
     design : Design
-    plant : LinearPlant, DifferenceModel or ContinuousPlant, optional
+    plant : LinearPlant, DifferenceModel, ContinuousPlant, or a state-dependent one
     scenario : Scenario, optional
     run : Run, optional
         Its controller is not stored but built again from the design.
     """
 
     design: Design
-    plant: LinearPlant | DifferenceModel | ContinuousPlant | None = None
+    plant: (
+        LinearPlant
+        | DifferenceModel
+        | ContinuousPlant
+        | StateDependentModel
+        | StateDependentPlant
+        | None
+    ) = None
     scenario: Scenario | None = None
     run: Run | None = None
 
@@ -53,6 +62,9 @@ KINDS: dict[str, type] = {
         Study,
         Design,
         DifferenceModel,
+        StateDependentModel,
+        StateDependentPlant,
+        Settling,
         LinearPlant,
         Between,
         ContinuousPlant,

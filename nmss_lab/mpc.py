@@ -7,7 +7,7 @@ shared.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any, Literal
 
@@ -27,6 +27,7 @@ from nmss_lab.pip import lq_cost
 from nmss_lab.predict import (
     Affine,
     Horizon,
+    blocks,
     cumulate,
     decided,
     difference,
@@ -94,20 +95,15 @@ def integral_of_error(
         positive definite.
     """
     form = integral_of_error_form(model)
-    problem = _Setup(model, form, horizon, reference, "held")
-    U = problem.free_moves(horizon.held(model.n_u))
-    steps = [U[_block(i, model.n_u)] for i in range(horizon.Np)]
-    offsets = [form.D @ r for r in problem.reference]
-    X = problem.predicted(steps, offsets)
+    problem = Setup(model, form, horizon, reference, "held")
+    U, dU = problem.levels()
+    X = problem.predicted(U, [form.D @ r for r in problem.reference])
     weight_x = weight("Q", Q, horizon.Np, form.n_x)
     weight_u = weight("R", R, horizon.Nc, model.n_u)
     if terminal == "lq":
         last = slice((horizon.Np - 1) * form.n_x, None)
         weight_x[last, last] = _riccati(form, weight_x[last, last], weight_u, model.n_u)
     costs = [Cost(X, weight_x), Cost(problem.decision, weight_u)]
-    first = np.eye(horizon.Np * model.n_u, model.n_u)
-    last_u = first @ known_part(problem.known, "u", problem.n_z)
-    dU = difference(horizon.Np, model.n_u) @ U - last_u
     built = problem.build(costs, U, dU, X, limits, terminal, backend)
     return replace(built, anti_windup=anti_windup)
 
@@ -277,10 +273,9 @@ def _incremental(
             'changes of the input has no sum of the error; use "held", "next" or '
             '"preview"'
         )
-    problem = _Setup(model, form, horizon, reference, forecast)
-    dU = problem.free_moves(horizon.impulses(model.n_u))
-    steps = [dU[_block(i, model.n_u)] for i in range(horizon.Np)]
-    X = problem.predicted(steps, problem.disturbances())
+    problem = Setup(model, form, horizon, reference, forecast)
+    U, dU = problem.increments()
+    X = problem.predicted(dU, problem.disturbances())
     weight_y = weight("Q", Q, horizon.Np, model.n_y)
     weight_du = weight("R", R, horizon.Nc, model.n_u)
     Y = np.kron(np.eye(horizon.Np), form.C) @ X
@@ -288,13 +283,10 @@ def _incremental(
     costs = [Cost(Y - S, weight_y), Cost(problem.decision, weight_du)]
     if terminal == "lq":
         costs.append(_tail(problem, X, weight_y, weight_du))
-    ones = np.tile(np.eye(model.n_u), (horizon.Np, 1))
-    last_u = ones @ known_part(problem.known, "u", problem.n_z)
-    U = cumulate(horizon.Np, model.n_u) @ dU + last_u
     return problem.build(costs, U, dU, X, limits, terminal, backend)
 
 
-class _Setup:
+class Setup:
     """What the builders share: the known vector, the reference, limits, assembly."""
 
     def __init__(
@@ -303,15 +295,16 @@ class _Setup:
         form: Form,
         horizon: Horizon,
         reference: Reading,
-        forecast: Forecast,
+        forecast: Forecast = "held",
+        **more: int | tuple[int, ...],
     ) -> None:
         self.model, self.form, self.horizon = model, form, horizon
         self.reading, self.forecast = reference, forecast
         self.n_z = horizon.Nc * model.n_u
-        self.known = self._layout()
+        self.known = self._layout(more)
         self.decision = decided(np.eye(self.n_z), self.known)
 
-    def _layout(self) -> Layout:
+    def _layout(self, more: Mapping[str, int | tuple[int, ...]]) -> Layout:
         sizes = {"held": 1, "next": 1, "preview": self.horizon.Np, "zero": 0}
         if self.reading not in sizes:
             raise ValueError(
@@ -328,6 +321,7 @@ class _Setup:
             r=(sizes[self.reading], model.n_y),
             dv=(self._past, model.n_v),
             dv_ahead=(self._ahead, model.n_v),
+            **more,
         )
 
     @property
@@ -341,9 +335,21 @@ class _Setup:
         held = self.forecast == "held" or not self.form.lags
         return 0 if held else self.horizon.Np - 1
 
-    def free_moves(self, spread: Array) -> Affine:
-        """Sequence over the horizon made of the decision alone."""
-        return decided(spread, self.known)
+    def levels(self) -> tuple[Affine, Affine]:
+        """Give decided inputs, held, and their changes, Np n_u rows each."""
+        horizon, n_u = self.horizon, self.model.n_u
+        U = decided(horizon.held(n_u), self.known)
+        first = np.eye(horizon.Np * n_u, n_u)
+        last_u = first @ known_part(self.known, "u", self.n_z)
+        return U, difference(horizon.Np, n_u) @ U - last_u
+
+    def increments(self) -> tuple[Affine, Affine]:
+        """Give inputs, and their changes that are decided, Np n_u rows each."""
+        horizon, n_u = self.horizon, self.model.n_u
+        dU = decided(horizon.impulses(n_u), self.known)
+        ones = np.tile(np.eye(n_u), (horizon.Np, 1))
+        last_u = ones @ known_part(self.known, "u", self.n_z)
+        return cumulate(horizon.Np, n_u) @ dU + last_u, dU
 
     @property
     def reference(self) -> list[Affine]:
@@ -353,7 +359,7 @@ class _Setup:
             nothing = Affine(np.zeros((p, self.n_z)), np.zeros((p, self.known.size)))
             return [nothing] * self.horizon.Np
         if self.reading == "preview":
-            return [part[_block(i, p)] for i in range(self.horizon.Np)]
+            return blocks(part, p)
         return [part] * self.horizon.Np
 
     def stacked_reference(self) -> Affine:
@@ -375,12 +381,12 @@ class _Setup:
                     offsets[i] = offsets[i] + G @ source[_block(block, r)]
         return offsets
 
-    def predicted(self, inputs: list[Affine], offsets: list[Affine]) -> Affine:
-        """States over the horizon, Np n_x rows."""
-        steps = self.horizon.Np
+    def predicted(self, inputs: Affine, offsets: list[Affine]) -> Affine:
+        """States over the horizon, Np n_x rows, for what drives the form."""
+        steps, n_u = self.horizon.Np, self.model.n_u
         state = known_part(self.known, "x", self.n_z)
         A, B = [self.form.A] * steps, [self.form.B] * steps
-        return predict(A, B, state, inputs, offsets)
+        return predict(A, B, state, blocks(inputs, n_u), offsets)
 
     def build(
         self,
@@ -397,6 +403,26 @@ class _Setup:
         limits = limits or Limits()
         find_backend(backend)
         Y = np.kron(np.eye(horizon.Np), self.form.C) @ X
+        rows = self.rows(U, dU, Y, limits, terminal)
+        program = assemble(costs, rows, "weights Q and R")
+        return PredictiveController(
+            model,
+            self.form,
+            limits,
+            horizon,
+            program,
+            {"u": U, "du": dU, "y": Y},
+            self.knowledge(),
+            output_ranks(program, limits, model.n_y),
+            backend,
+            self.forecast,
+        )
+
+    def rows(
+        self, U: Affine, dU: Affine, Y: Affine, limits: Limits, terminal: Terminal
+    ) -> list[Limit]:
+        """List what is limited along the horizon."""
+        model, horizon = self.model, self.horizon
         moves, steps = horizon.rows_of_moves(model.n_u), np.arange(horizon.Np)
         rows = [
             limit("u", U[moves], limits.of("u", model.n_u), horizon.starts),
@@ -414,19 +440,7 @@ class _Setup:
             raise ValueError(
                 f'terminal = "{terminal}": expected "none", "equality" or "lq"'
             )
-        program = assemble(costs, rows, "weights Q and R")
-        return PredictiveController(
-            model,
-            self.form,
-            limits,
-            horizon,
-            program,
-            {"u": U, "du": dU, "y": Y},
-            self.knowledge(),
-            output_ranks(program, limits, model.n_y),
-            backend,
-            self.forecast,
-        )
+        return rows
 
     def _rest(self, Y: Affine, dU: Affine) -> Limit:
         """Rows of (C.2.1): na + 1 outputs at r, nb - 1 changes of inputs at zero."""
@@ -487,7 +501,7 @@ def _riccati(form: Form, Q: Array, R: Array, n_u: int) -> Array:
     return lq_cost(form.A, form.B, Q, R[-n_u:, -n_u:])
 
 
-def _tail(problem: _Setup, X: Affine, weight_y: Array, weight_du: Array) -> Cost:
+def _tail(problem: Setup, X: Affine, weight_y: Array, weight_du: Array) -> Cost:
     """LQ cost beyond the horizon, on the last state seen from rest at r."""
     form, model, Np = problem.form, problem.model, problem.horizon.Np
     last_y, last_u = slice(-model.n_y, None), slice(-model.n_u, None)

@@ -188,6 +188,19 @@ def integral_of_error_form(model: DifferenceModel, governed: bool = False) -> Fo
     )
 
 
+def past_form(model: DifferenceModel) -> Form:
+    """Form of past outputs and inputs alone, as they are: (3.2) without the sum."""
+    plain, names = _past(model)
+    n, p = plain["A"].shape[0], model.n_y
+    layout = _layout(model)
+    rows = [_rows(layout, "y", model.na), _rows(layout, "u", model.nb - 1)]
+    recipe = _recipe(model, layout, np.vstack(rows))
+    none = np.zeros((n, 0))
+    return Form(
+        plain["A"], plain["B"], np.eye(p, n), np.zeros((n, p)), none, "u", recipe, names
+    )
+
+
 def differenced_form(
     model: DifferenceModel,
     internal_model: bool = False,

@@ -87,6 +87,11 @@ def stack(signals: Sequence[Affine]) -> Affine:
     )
 
 
+def blocks(signal: Affine, size: int) -> list[Affine]:
+    """Parts of ``size`` rows, one a step."""
+    return [signal[slice(i, i + size)] for i in range(0, len(signal), size)]
+
+
 def known_part(known: Layout, name: str, n_z: int) -> Affine:
     """Part ``name`` of the known vector as a signal that no decision moves."""
     rows = known.select(name)

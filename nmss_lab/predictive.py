@@ -42,6 +42,104 @@ class Knowledge:
 
 
 @dataclass(frozen=True, eq=False)
+class RankedProgram:
+    """A program whose rows give way, in the order of their ranks, when they must.
+
+    Parameters
+    ----------
+    program : QuadraticProgram
+    ranks : integer array (rows,)
+        Rows of the highest rank give way first; -1 for rows that never do, 0 for the
+        inputs of a governed loop.
+    limits : Limits
+        Says how outputs give way, and at which price.
+    backend : str
+    """
+
+    program: QuadraticProgram
+    ranks: Array
+    limits: Limits
+    backend: str
+
+    def solve(
+        self, theta: Array, bounds: tuple[Array, Array], guess: Guess | None = None
+    ) -> tuple[Solution, Status]:
+        """Solve with all rows; if that fails let rows give way as the limits say."""
+        governed = (self.ranks == 0).any()
+        if self.limits.outputs == "soft" and self._soft.size:
+            solution, status = self._solve_relaxed(theta, bounds)
+            if solution.found or not governed:
+                return solution, status
+        solution = solve(self.program, theta, self.backend, bounds, guess)
+        if solution.found or not self._giving.size:
+            return solution, Status.LIMITED
+        if self.limits.outputs == "priority" or governed:
+            return self._solve_by_rank(theta, bounds)
+        return self._solve_without(theta, bounds)
+
+    @cached_property
+    def _giving(self) -> Array:
+        return np.flatnonzero(self.ranks >= 0)
+
+    @cached_property
+    def _without_outputs(self) -> QuadraticProgram:
+        names = {self.program.labels[i].name for i in self._giving}
+        return self.program.without(*names)
+
+    def _solve_without(
+        self, theta: Array, bounds: tuple[Array, Array]
+    ) -> tuple[Solution, Status]:
+        """Drop the rows that may give way (6.1.2)."""
+        keep = self.ranks < 0
+        low, high = bounds
+        solution = solve(
+            self._without_outputs, theta, self.backend, (low[keep], high[keep])
+        )
+        multipliers = np.zeros(len(keep))
+        multipliers[keep] = solution.multipliers
+        return _cut(solution, self.program.n_z, multipliers), Status.DROPPED
+
+    @cached_property
+    def _soft(self) -> Array:
+        """Rows with a price; the inputs of a governed loop (rank 0) have none."""
+        return np.flatnonzero(self.ranks > 0)
+
+    @cached_property
+    def _relaxed(self) -> QuadraticProgram:
+        weight = np.full(self._soft.size, self.limits.soft_weight)
+        return self.program.softened(self._soft, weight)
+
+    def _solve_relaxed(
+        self, theta: Array, bounds: tuple[Array, Array]
+    ) -> tuple[Solution, Status]:
+        """Pay a quadratic price for breaking output limits."""
+        solution = solve(self._relaxed, theta, self.backend, bounds)
+        broken = np.abs(solution.decision[self.program.n_z :]).max(initial=0.0) > 1e-6
+        status = Status.SOFTENED if broken else Status.LIMITED
+        return _cut(solution, self.program.n_z, solution.multipliers), status
+
+    def _solve_by_rank(
+        self, theta: Array, bounds: tuple[Array, Array]
+    ) -> tuple[Solution, Status]:
+        """Break each rank of rows as little as the more important ones allow."""
+        low, high = bounds[0].copy(), bounds[1].copy()
+        for rank in np.unique(self.ranks[self._giving]):
+            rows = np.flatnonzero(self.ranks == rank)
+            later = self.ranks > rank
+            free = np.where(later, -np.inf, low), np.where(later, np.inf, high)
+            weight = np.full(rows.size, 1e6 * np.abs(self.program.H).max())
+            program = self.program.softened(rows, weight)
+            solution = solve(program, theta, self.backend, free)
+            if not solution.found:
+                return solution, Status.SHIFTED
+            missed, margin = solution.decision[self.program.n_z :], 1e-7
+            low[rows] -= np.maximum(missed, 0.0) + margin
+            high[rows] += np.maximum(-missed, 0.0) + margin
+        solution = solve(self.program, theta, self.backend, (low, high))
+        return solution, Status.SOFTENED
+
+
+@dataclass(frozen=True, eq=False)
 class PredictiveController(Controller):
     """A design that decides by a quadratic program; frozen, and shared by many loops.
 
@@ -96,6 +194,11 @@ class PredictiveController(Controller):
     def forecast_steps(self) -> int:
         """How many samples of v beyond v_k are read."""
         return max(self.knowledge.from_v.shape[1] // max(self.model.n_v, 1) - 1, 0)
+
+    @cached_property
+    def ranked(self) -> RankedProgram:
+        """The program with the order in which its rows give way."""
+        return RankedProgram(self.program, self.ranks, self.limits, self.backend)
 
     @cached_property
     def first_move(self) -> Affine:
@@ -201,7 +304,7 @@ class PredictiveController(Controller):
         """Fill in row i, where the free optimum breaks a limit."""
         before = self.last_input(memory.vector[i])
         guess = memory.decision[i], memory.multipliers[i]
-        solution, status = self._solve(
+        solution, status = self.ranked.solve(
             move.known[i],
             self._reachable(before),
             guess if memory.shift[i] >= 0 else None,
@@ -240,83 +343,6 @@ class PredictiveController(Controller):
         move.u[:] = clipped
         move.cost[:] = self.program.cost(move.decision, move.known)
         return move
-
-    def _solve(
-        self, theta: Array, bounds: tuple[Array, Array], guess: Guess | None
-    ) -> tuple[Solution, Status]:
-        """Solve with all rows; if that fails let rows give way as the limits say."""
-        governed = (self.ranks == 0).any()
-        if self.limits.outputs == "soft" and self._soft.size:
-            solution, status = self._solve_relaxed(theta, bounds)
-            if solution.found or not governed:
-                return solution, status
-        solution = solve(self.program, theta, self.backend, bounds, guess)
-        if solution.found or not self._giving.size:
-            return solution, Status.LIMITED
-        if self.limits.outputs == "priority" or governed:
-            return self._solve_by_rank(theta, bounds)
-        return self._solve_without(theta, bounds)
-
-    @cached_property
-    def _giving(self) -> Array:
-        return np.flatnonzero(self.ranks >= 0)
-
-    @cached_property
-    def _without_outputs(self) -> QuadraticProgram:
-        names = {self.program.labels[i].name for i in self._giving}
-        return self.program.without(*names)
-
-    def _solve_without(
-        self, theta: Array, bounds: tuple[Array, Array]
-    ) -> tuple[Solution, Status]:
-        """Drop the rows that may give way (6.1.2)."""
-        keep = self.ranks < 0
-        low, high = bounds
-        solution = solve(
-            self._without_outputs, theta, self.backend, (low[keep], high[keep])
-        )
-        multipliers = np.zeros(len(keep))
-        multipliers[keep] = solution.multipliers
-        return _cut(solution, self.n_z, multipliers), Status.DROPPED
-
-    @cached_property
-    def _soft(self) -> Array:
-        """Rows with a price; the inputs of a governed loop (rank 0) have none."""
-        return np.flatnonzero(self.ranks > 0)
-
-    @cached_property
-    def _relaxed(self) -> QuadraticProgram:
-        weight = np.full(self._soft.size, self.limits.soft_weight)
-        return self.program.softened(self._soft, weight)
-
-    def _solve_relaxed(
-        self, theta: Array, bounds: tuple[Array, Array]
-    ) -> tuple[Solution, Status]:
-        """Pay a quadratic price for breaking output limits."""
-        solution = solve(self._relaxed, theta, self.backend, bounds)
-        broken = np.abs(solution.decision[self.n_z :]).max(initial=0.0) > 1e-6
-        status = Status.SOFTENED if broken else Status.LIMITED
-        return _cut(solution, self.n_z, solution.multipliers), status
-
-    def _solve_by_rank(
-        self, theta: Array, bounds: tuple[Array, Array]
-    ) -> tuple[Solution, Status]:
-        """Break each rank of rows as little as the more important ones allow."""
-        low, high = bounds[0].copy(), bounds[1].copy()
-        for rank in np.unique(self.ranks[self._giving]):
-            rows = np.flatnonzero(self.ranks == rank)
-            later = self.ranks > rank
-            free = np.where(later, -np.inf, low), np.where(later, np.inf, high)
-            weight = np.full(rows.size, 1e6 * np.abs(self.program.H).max())
-            program = self.program.softened(rows, weight)
-            solution = solve(program, theta, self.backend, free)
-            if not solution.found:
-                return solution, Status.SHIFTED
-            missed, margin = solution.decision[self.n_z :], 1e-7
-            low[rows] -= np.maximum(missed, 0.0) + margin
-            high[rows] += np.maximum(-missed, 0.0) + margin
-        solution = solve(self.program, theta, self.backend, (low, high))
-        return solution, Status.SOFTENED
 
     def _reachable(self, before: Array) -> tuple[Array, Array]:
         """Bounds of the rows, level limits widened to what the rates can reach."""

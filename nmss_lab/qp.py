@@ -232,15 +232,20 @@ def _rows(limit: Limit) -> tuple[Array, list[Row], list[Row]]:
         for step in limit.steps
         for i in range(limit.channels)
     ]
-    bounded = np.isfinite(limit.lower) | np.isfinite(limit.upper)
-    size = np.abs(limit.signal.gain).max(axis=1, initial=0.0)
-    moved = size > 1e-12 * max(1.0, size.max(initial=0.0))
+    bounded, moved = matters(limit)
     table = np.column_stack(
         [limit.signal.gain, limit.signal.known, limit.lower, limit.upper]
     )
     kept = [label for label, ok in zip(labels, bounded & moved, strict=True) if ok]
     left = [label for label, ok in zip(labels, bounded & ~moved, strict=True) if ok]
     return table[bounded & moved], kept, left
+
+
+def matters(limit: Limit) -> tuple[Array, Array]:
+    """Which rows have a finite bound, and which the decision can move, (rows,) each."""
+    bounded = np.isfinite(limit.lower) | np.isfinite(limit.upper)
+    size = np.abs(limit.signal.gain).max(axis=1, initial=0.0)
+    return bounded, size > 1e-12 * max(1.0, size.max(initial=0.0))
 
 
 def weight(name: str, value: Any, steps: int, size: int) -> Array:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,6 +12,10 @@ import numpy as np
 from nmss_lab.controller import Controller, Memory, Move, Status
 from nmss_lab.models import Array, DifferenceModel, LinearPlant, Numbers, Plant
 from nmss_lab.predictive import PredictiveController
+from nmss_lab.state_dependent import StateDependentModel
+
+Equation = DifferenceModel | StateDependentModel
+"""A model that can be its own plant."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,6 +42,8 @@ class Scenario:
         Whether an internal model is driven by the disturbed input.
     y0, u0, v0 : arrays (n_y,), (n_u,), (n_v,), optional
         Constant past; y0 is left to the plant's equilibrium where it is not given.
+    z0 : array (n_y,), optional
+        Sum of the error before the first sample; what holds u0 where it is not given.
 
     Raises
     ------
@@ -55,6 +62,7 @@ class Scenario:
     y0: Numbers | None = None
     u0: Numbers | None = None
     v0: Numbers | None = None
+    z0: Numbers | None = None
 
     def __post_init__(self) -> None:
         """Check lengths and make every series two-dimensional."""
@@ -194,13 +202,13 @@ class Sample:
 
 
 def samples(
-    plant: Plant | DifferenceModel, controller: Controller, scenario: Scenario
+    plant: Plant | Equation, controller: Controller, scenario: Scenario
 ) -> Iterator[Sample]:
     """Run the loop sample by sample; stop whenever you like.
 
     Parameters
     ----------
-    plant : Plant or DifferenceModel
+    plant : Plant, DifferenceModel or StateDependentModel
         A ``LinearPlant``, a model as its own plant, or anything with ``reset``,
         ``output`` and ``step``.
     controller : Controller
@@ -234,7 +242,7 @@ def samples(
 
 
 def closed_loop(
-    plant: Plant | DifferenceModel, controller: Controller, scenario: Scenario
+    plant: Plant | Equation, controller: Controller, scenario: Scenario
 ) -> Run:
     """Run the whole loop; see ``samples`` for the arguments and errors."""
     return _collect(_Single(plant), controller, scenario, keep_moves=True)[0]
@@ -267,11 +275,42 @@ def closed_loops(
     return _collect(_Stacked(plants), controller, scenario, keep_moves)
 
 
+def many_loops(
+    tasks: Iterable[tuple[Plant | Equation, Controller, Scenario]],
+    executor: Executor | None = None,
+) -> Iterator[Run]:
+    """Run loops that differ in plant, controller or scenario.
+
+    Parameters
+    ----------
+    tasks : iterable of (plant, controller, scenario)
+        See ``samples``.
+    executor : concurrent.futures.Executor, optional
+        Where to run them; here and one after the other by default.  Results do not
+        depend on it.
+
+    Yields
+    ------
+    Run
+        In the order of the tasks, as soon as each is done.
+
+    Raises
+    ------
+    ValueError
+        As ``samples``.
+    """
+    yield from (executor.map if executor else map)(_loop_of, tasks)
+
+
+def _loop_of(task: tuple[Plant | Equation, Controller, Scenario]) -> Run:
+    return closed_loop(*task)
+
+
 class _Single:
     """One plant of any kind as an ensemble of one."""
 
-    def __init__(self, model: Plant | DifferenceModel) -> None:
-        plant: Plant = model.plant() if isinstance(model, DifferenceModel) else model
+    def __init__(self, model: Plant | Equation) -> None:
+        plant: Plant = model.plant() if isinstance(model, Equation) else model
         self.plant, self.size = plant, 1
         self.dt, self.n_y = plant.dt, plant.n_y
         self.n_u, self.n_v = plant.n_u, plant.n_v
@@ -376,7 +415,7 @@ def _lock_step(
     u0, v0 = _constant(scenario.u0, model.n_u), _constant(scenario.v0, plants.n_v)
     state = plants.reset(u0, v0, scenario.y0)
     y0 = plants.output(state)
-    memory = _start(controller, y0, u0, v0, r[0])
+    memory = _start(controller, y0, u0, v0, r[0], scenario.z0)
     ahead_r = _padded(r, controller.preview)
     ahead_v = _padded(v, controller.forecast_steps)
     knows_v = model.n_v > 0
@@ -402,11 +441,16 @@ def _lock_step(
 
 
 def _start(
-    controller: Controller, y0: Array, u0: Array, v0: Array, r0: Array
+    controller: Controller,
+    y0: Array,
+    u0: Array,
+    v0: Array,
+    r0: Array,
+    z0: Numbers | None,
 ) -> Memory:
     """Memories of all loops, stacked."""
     known_v = v0 if controller.model.n_v else None
-    starts = [controller.start(y, u0, known_v, r0) for y in y0]
+    starts = [controller.start(y, u0, known_v, r0, z0) for y in y0]
     names = Memory.__dataclass_fields__
     return Memory(*(np.stack([getattr(m, name) for m in starts]) for name in names))
 

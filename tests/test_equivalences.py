@@ -15,7 +15,7 @@ from strategies import (
 )
 
 from nmss_lab import qp
-from nmss_lab.cases import CASES, case
+from nmss_lab.cases import LINEAR_CASES, case
 from nmss_lab.controller import Limits, Status
 from nmss_lab.governor import governor
 from nmss_lab.models import DifferenceModel
@@ -345,7 +345,7 @@ def limited_run(example, design):
     return run
 
 
-@pytest.mark.parametrize("name", sorted(CASES))
+@pytest.mark.parametrize("name", sorted(LINEAR_CASES))
 def test_solvers_agree_on_the_worked_examples(name):
     """On the applied move to 1e-6, wherever a limit is active in the case's run."""
     example, compared = case(name), 0

@@ -209,7 +209,7 @@ def _literal_increment() -> Iterator[Claim]:
 def _printed_3_13() -> Array:
     """Output under (3.13) with the branches exactly as printed."""
     case = case_of("governor_3_4")
-    K, plant = case.designs["pip"].options["K"][0], case.plant
+    K, plant = case.designs["pip"].options["K"][0], case.model.plant()
     state = plant.reset(np.zeros(1), np.zeros(0), np.zeros(1))
     y_before = u = z = 0.0
     x_before, outputs = np.zeros(4), []

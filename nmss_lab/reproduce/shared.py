@@ -11,13 +11,13 @@ from nmss_lab import cases
 from nmss_lab.analysis import LinearLoop, linear_loop
 from nmss_lab.design import Design
 from nmss_lab.measures import steps, violations
-from nmss_lab.models import Array, LinearPlant
+from nmss_lab.models import Array, LinearPlant, Plant
 from nmss_lab.predict import Horizon
 from nmss_lab.predictive import PredictiveController
-from nmss_lab.simulate import Run, Scenario, closed_loop, closed_loops
+from nmss_lab.simulate import Equation, Run, Scenario, closed_loop, closed_loops
 
 
-def simulated(design: Design, plant: LinearPlant, scenario: Scenario) -> Run:
+def simulated(design: Design, plant: Plant | Equation, scenario: Scenario) -> Run:
     """Run a design in closed loop."""
     return closed_loop(plant, design.build(), scenario)
 

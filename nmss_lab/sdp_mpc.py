@@ -1,0 +1,998 @@
+r"""Predictive control of state-dependent plants (thesis 8.3, 8.4), and beyond.
+
+The quadratic program is that of the linear structures, with coefficients that change
+along the horizon.  They depend on the plan, so program and plan have to be brought to
+agree (Algorithm 8.3.1): predict under the plan, read the coefficients along the way,
+solve, and repeat until the plan stops moving.  Which coefficients are read is the
+scheme:
+
+- ``"frozen"``: those of the present sample, all along; solved once.
+- ``"iterated"``: those along the predicted trajectory.  A fixed point is optimal for
+  coefficients that the plan does not move, in general not for the plant.
+- ``"gauss-newton"``: the derivatives of the equation along the trajectory, and what
+  is left over as a known offset.  The gradient is that of the true problem, so a fixed
+  point meets its optimality conditions.
+- ``"newton"``: the same with the curvature of the equation in the Hessian.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import logging
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+import scipy.linalg
+
+from nmss_lab.controller import Limits, Memory, Move, Status
+from nmss_lab.models import Array
+from nmss_lab.mpc import Reading, Setup, Terminal
+from nmss_lab.nmss import Form, Layout, integral_of_error_form, past_form
+from nmss_lab.predict import Affine, Horizon, blocks, known_part, predict, stack
+from nmss_lab.predictive import (
+    Knowledge,
+    PredictiveController,
+    RankedProgram,
+    output_ranks,
+)
+from nmss_lab.qp import (
+    Cost,
+    QPStatus,
+    QuadraticProgram,
+    Row,
+    Solution,
+    find_backend,
+    matters,
+    sum_of_squares,
+    weight,
+)
+from nmss_lab.sdp import NOT_LINEAR, expected, follow, missed_by, thesis_state
+from nmss_lab.state_dependent import StateDependentModel
+
+LOG = logging.getLogger(__name__)
+
+Scheme = Literal["frozen", "iterated", "gauss-newton", "newton"]
+SCHEMES: tuple[Scheme, ...] = ("frozen", "iterated", "gauss-newton", "newton")
+
+LARGEST = 1e100
+"""Programs with larger entries are not handed to a solver."""
+
+RUNAWAY = 1e8
+"""Predicted outputs this many times beyond what is known count as running away."""
+
+
+@dataclass(frozen=True)
+class Settling:
+    """How plan and predictions are brought to agree.
+
+    Parameters
+    ----------
+    scheme : "frozen", "iterated", "gauss-newton" or "newton"
+    damping : float
+        Share of each step that is left out, for the scheme "iterated": 0 is the plain
+        Algorithm 8.3.1.  The other schemes halve a step that does not lower the cost.
+    tolerance : float
+        Largest change of the plan that counts as settled, relative to 1 + its size.
+    passes : int
+        Most programs solved in a sample.
+    seconds : float
+        Time a sample may take.
+    warm_start : bool
+        Whether to start from the last plan, shifted; otherwise from the frozen model.
+
+    Raises
+    ------
+    ValueError
+        If a value is out of range.
+    """
+
+    scheme: Scheme = "iterated"
+    damping: float = 0.5
+    tolerance: float = 1e-8
+    passes: int = 100
+    seconds: float = np.inf
+    warm_start: bool = True
+
+    def __post_init__(self) -> None:
+        """Check each value."""
+        if self.scheme not in SCHEMES:
+            raise ValueError(
+                f'scheme = "{self.scheme}": expected one of {", ".join(SCHEMES)}'
+            )
+        if not 0.0 <= self.damping < 1.0:
+            raise ValueError(f"damping = {self.damping}: expected 0 <= damping < 1")
+        if not self.tolerance > 0.0:
+            raise ValueError(f"tolerance = {self.tolerance} must be positive")
+        if isinstance(self.passes, bool) or not self.passes >= 1:
+            raise ValueError(f"passes = {self.passes}: expected at least 1")
+        if not self.seconds > 0.0:
+            raise ValueError(f"seconds = {self.seconds} must be positive")
+
+
+@dataclass(frozen=True, eq=False)
+class Point:
+    """A plan, what the plant would do under it, and the program made there.
+
+    Parameters
+    ----------
+    z : array (n_z,)
+    theta : array (n_theta,)
+        Known vector of the program.
+    program : QuadraticProgram
+    Y : Affine
+        Outputs as the program predicts them, Np n_y rows.
+    U : array (Np, n_u)
+    y : array (Np, n_y)
+        Outputs of the model itself under U.
+    cost : float
+        J of the plan with those outputs.
+    missed : float
+        Sum of what the outputs' limits are broken by.
+    frozen : bool
+        Whether the coefficients are those of the present sample.
+    """
+
+    z: Array
+    theta: Array
+    program: QuadraticProgram
+    Y: Affine
+    U: Array
+    y: Array
+    cost: float
+    missed: float
+    frozen: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Pass:
+    """One pass of Algorithm 8.3.1: a plan, and the optimum of the program made there.
+
+    Parameters
+    ----------
+    point : Point
+    solution : Solution
+    status : Status
+        FREE, LIMITED, or how rows gave way.
+    change : float
+        Largest entry of the way from the plan to the optimum.
+    """
+
+    point: Point
+    solution: Solution
+    status: Status
+    change: float
+
+
+class Problem:
+    """The problem of a sample: everything that depends on the design only.
+
+    Parameters
+    ----------
+    equation : StateDependentModel
+    setup : Setup
+        On the wide model, with the parts "c" (offset of the equation at each step) and
+        "one" (the number 1) in its known vector.
+    weight_x, weight_z : arrays
+        Weights of all predicted states (or errors of outputs), and of the decision.
+    increments : bool
+        Whether changes of the input are decided and errors of outputs weighed (8.4),
+        or inputs decided and states weighed (8.3).
+    limits, terminal : see ``nmss_lab.mpc.integral_of_error``
+    """
+
+    def __init__(
+        self,
+        equation: StateDependentModel,
+        setup: Setup,
+        weight_x: Array,
+        weight_z: Array,
+        increments: bool,
+        limits: Limits,
+        terminal: Terminal,
+    ) -> None:
+        self.equation, self.setup, self.increments = equation, setup, increments
+        self.weight_x, self.weight_z = weight_x, weight_z
+        self.limits, self.terminal = limits, terminal
+        self.known, self.horizon = setup.known, setup.horizon
+        self.U, self.dU = setup.increments() if increments else setup.levels()
+        self._inputs = blocks(self.U, equation.n_u)
+        self._state = known_part(self.known, "x", setup.n_z)
+        self._offsets = self._offset_signals()
+        self._reference = setup.stacked_reference()
+        self._lay_out_rows()
+
+    def _lay_out_rows(self) -> None:
+        """Find the rows with limits, and which output each of them reads."""
+        n, n_z = self.horizon.Np * self.equation.n_y, self.setup.n_z
+        still = np.zeros((n, self.known.size))
+        numbers = np.tile(np.arange(1.0, n + 1)[:, None], n_z)
+        rows, bare = (
+            self.setup.rows(
+                self.U, self.dU, Affine(gain, still), self.limits, self.terminal
+            )
+            for gain in (numbers, 0.0 * numbers)
+        )
+        kept = np.concatenate([np.logical_and(*matters(row)) for row in rows])
+        self._fixed = stack([row.signal for row in bare])[kept]
+        marks = (stack([row.signal for row in rows])[kept] - self._fixed).gain[:, 0]
+        self.on_outputs = marks > 0.5
+        self._reads = marks[self.on_outputs].astype(int) - 1
+        lower, upper = (
+            np.concatenate([getattr(row, side) for row in rows])[kept]
+            for side in ("lower", "upper")
+        )
+        labels = tuple(
+            Row(row.name, i, int(step))
+            for row in rows
+            for step in row.steps
+            for i in range(row.channels)
+        )
+        self.template = QuadraticProgram(
+            np.eye(n_z),
+            np.zeros((n_z, self.known.size)),
+            np.zeros((self.known.size,) * 2),
+            self._fixed.gain,
+            self._fixed.known,
+            lower,
+            upper,
+            tuple(label for label, ok in zip(labels, kept, strict=True) if ok),
+        )
+
+    def _offset_signals(self) -> list[Affine]:
+        """List what enters each state: the reference, and the equation's c."""
+        setup, form = self.setup, self.setup.form
+        p, n_x = self.equation.n_y, form.n_x
+        enter = np.zeros((n_x, p))
+        enter[:p] = np.eye(p)
+        if "integral" in form.recipe.layout:
+            enter[-p:] = -np.eye(p)
+        c = blocks(known_part(self.known, "c", setup.n_z), p)
+        return [
+            form.D @ r + enter @ c_i for r, c_i in zip(setup.reference, c, strict=True)
+        ]
+
+    def _matrices(self, a: Array, b: Array) -> tuple[Array, Array]:
+        """Fill A (Np, n_x, n_x) and B (Np, n_x, n_u) from coefficients of each step."""
+        form, p = self.setup.form, self.equation.n_y
+        steps, na = a.shape[:2]
+        nb, q = b.shape[1], self.equation.n_u
+        A = np.broadcast_to(form.A, (steps, *form.A.shape)).copy()
+        B = np.broadcast_to(form.B, (steps, *form.B.shape)).copy()
+        wide = self.equation.y_lags * p
+        A[:, :p, : na * p] = -a.swapaxes(1, 2).reshape(steps, p, na * p)
+        past = b[:, 1:].swapaxes(1, 2).reshape(steps, p, (nb - 1) * q)
+        A[:, :p, wide : wide + past.shape[2]] = past
+        B[:, :p] = b[:, 0]
+        if "integral" in form.recipe.layout:
+            A[:, -p:, :-p] = -A[:, :p, :-p]
+            B[:, -p:] = -b[:, 0]
+        return A, B
+
+    def past(self, theta: Array) -> tuple[Array, Array, Array]:
+        """y_k, y_{k-1}, ... and u_{k-1}, ..., and the load, from a known vector."""
+        eq, x = self.equation, theta[self.known["x"]]
+        n = eq.y_lags * eq.n_y
+        y = x[:n].reshape(eq.y_lags, eq.n_y)
+        u = x[n : n + (eq.u_lags - 1) * eq.n_u].reshape(eq.u_lags - 1, eq.n_u)
+        return y, u, theta[self.known["c"]][: eq.n_y]
+
+    def rolled(self, z: Array, theta: Array) -> tuple[Array, Array]:
+        """Give inputs (Np, n_u) of a plan and the outputs (Np, n_y) under them."""
+        y, u, load = self.past(theta)
+        U = self.U.value(z, theta).reshape(self.horizon.Np, -1)
+        return U, self.equation.roll_out(y, u, U, load)
+
+    def at(self, z: Array, theta: Array, scheme: Scheme) -> Point:
+        """Point of a plan: predict, read the coefficients, make the program."""
+        y, u, load = self.past(theta)
+        U, outputs = self.rolled(z, theta)
+        steps, theta = self.horizon.Np, theta.copy()
+        frozen = scheme == "frozen"
+        if not np.isfinite(outputs).all() and not frozen:
+            return self._ran_away(z, theta, U, outputs)
+        if frozen:
+            last = np.concatenate([theta[self.known["u"]][None], u])
+            a, b = self.equation.coefficients(y, last)
+            a, b = (np.broadcast_to(c, (steps, *c.shape)) for c in (a, b))
+        else:
+            seen = self.equation.windows(y, u, outputs, U)
+            a, b, c = self._along(scheme, seen, outputs, load)
+            theta[self.known["c"]] = c.ravel()
+        if not (np.isfinite(a).all() and np.isfinite(b).all()):
+            return self._ran_away(z, theta, U, outputs)
+        A, B = self._matrices(a, b)
+        with np.errstate(all="ignore"):  # looked at just below
+            X = predict(list(A), list(B), self._state, self._inputs, self._offsets)
+            Y = self._outputs_of(X)
+            program = self._program(X, Y)
+            size = np.abs(program.H).max() + np.abs(program.f @ theta).max()
+        if not size < LARGEST:
+            return self._ran_away(z, theta, U, outputs)
+        if scheme == "newton":
+            program = self._with_curvature(program, z, theta, X, seen)
+        cost = (
+            float(program.cost(z, theta))
+            if scheme != "newton"
+            else self._cost(z, theta, X, Y)
+        )
+        return Point(
+            z, theta, program, Y, U, outputs, cost, self.missed(outputs, theta), frozen
+        )
+
+    def _along(
+        self, scheme: Scheme, seen: tuple[Array, Array], outputs: Array, load: Array
+    ) -> tuple[Array, Array, Array]:
+        """Coefficients of each step and what they leave of the equation."""
+        if scheme == "iterated":
+            a, b = self.equation.coefficients(*seen)
+            return a, b, np.broadcast_to(load, outputs.shape)
+        a, b = self.equation.derivative(*seen)
+        y, u = (part[..., None] for part in seen)
+        linear = ((b @ u).sum(1) - (a @ y).sum(1))[..., 0]
+        return a, b, outputs - linear
+
+    def _ran_away(self, z: Array, theta: Array, U: Array, outputs: Array) -> Point:
+        n_z, n = self.setup.n_z, len(outputs.ravel())
+        nothing = Affine(np.zeros((n, n_z)), np.zeros((n, self.known.size)))
+        program = self._program_of(np.eye(n_z + self.known.size), nothing)
+        return Point(z, theta, program, nothing, U, outputs, np.inf, np.inf)
+
+    def _outputs_of(self, X: Affine) -> Affine:
+        n_x, p = self.setup.form.n_x, self.equation.n_y
+        rows = (np.arange(self.horizon.Np)[:, None] * n_x + np.arange(p)).ravel()
+        return X[rows]
+
+    def _program(self, X: Affine, Y: Affine) -> QuadraticProgram:
+        weighed = Y - self._reference if self.increments else X
+        costs = [Cost(weighed, self.weight_x), Cost(self.setup.decision, self.weight_z)]
+        return self._program_of(sum_of_squares(costs), Y)
+
+    def _program_of(self, table: Array, Y: Affine) -> QuadraticProgram:
+        """Program with the cost ``table`` on [z; theta] and all rows of the design."""
+        n_z = self.setup.n_z
+        M, offset = self._fixed.gain.copy(), self._fixed.known.copy()
+        M[self.on_outputs] += Y.gain[self._reads]
+        offset[self.on_outputs] += Y.known[self._reads]
+        still = self.on_outputs & (np.abs(M).max(axis=1, initial=0.0) < 1e-12)
+        lower = np.where(still, -np.inf, self.template.lower)
+        upper = np.where(still, np.inf, self.template.upper)
+        # solvers read memory as it lies: no views
+        H, f = table[:n_z, :n_z].copy(), table[:n_z, n_z:].copy()
+        constant = table[n_z:, n_z:]
+        labels = self.template.labels
+        return QuadraticProgram(H, f, constant, M, offset, lower, upper, labels)
+
+    def _with_curvature(
+        self,
+        program: QuadraticProgram,
+        z: Array,
+        theta: Array,
+        X: Affine,
+        seen: tuple[Array, Array],
+    ) -> QuadraticProgram:
+        """Program whose Hessian is that of the true cost, made positive definite.
+
+        An offset c_i of the equation stands in the known vector, so the program itself
+        says what J gains by it; that price times the equation's curvature, along the
+        windows that a plan moves, is what the Jacobian leaves out.
+        """
+        c = self.known["c"]
+        price = (program.f[:, c].T @ z + program.constant[c] @ theta).reshape(
+            self.horizon.Np, -1
+        )
+        bent = np.einsum("ij,ijab->iab", price, self.equation.curvature(*seen))
+        W = self._window_gains(X)
+        H = program.H + np.einsum("iaz,iab,ibw->zw", W, bent, W)
+        values, vectors = np.linalg.eigh((H + H.T) / 2.0)
+        values = np.maximum(np.abs(values), 1e-8 * np.abs(values).max())
+        H = (vectors * values) @ vectors.T
+        f = program.f.copy()
+        f[:, self.known["one"].start] += (program.H - H) @ z
+        return dataclasses.replace(program, H=H, f=f)
+
+    def _window_gains(self, X: Affine) -> Array:
+        """How a decision moves the past values of each step, (Np, m, n_z)."""
+        eq, Np, n_x = self.equation, self.horizon.Np, self.setup.form.n_x
+        n_z, p, q = self.setup.n_z, eq.n_y, eq.n_u
+        states = np.concatenate(
+            [np.zeros((1, n_x, n_z)), X.gain.reshape(Np, n_x, n_z)[:-1]]
+        )
+        inputs = self.U.gain.reshape(Np, q, n_z)
+        y, u = eq.y_lags * p, (eq.u_lags - 1) * q
+        return np.concatenate([states[:, :y], inputs, states[:, y : y + u]], axis=1)
+
+    def _cost(self, z: Array, theta: Array, X: Affine, Y: Affine) -> float:
+        weighed = Y - self._reference if self.increments else X
+        value = weighed.value(z, theta)
+        return float(value @ self.weight_x @ value + z @ self.weight_z @ z)
+
+    def missed(self, outputs: Array, theta: Array) -> float:
+        """Sum of what outputs (Np, n_y) break their limits by."""
+        low, high = self.limits.of("y", self.equation.n_y)
+        beyond = np.maximum(np.maximum(low - outputs, outputs - high), 0.0)
+        return float(beyond.sum())
+
+    def from_inputs(self, U: Array, theta: Array) -> Array:
+        """Decision whose inputs come closest to U (Np, n_u), step by step."""
+        chosen = U[self.horizon.starts]
+        if not self.increments:
+            return chosen.ravel()
+        before = theta[self.known["u"]][None]
+        return np.diff(np.concatenate([before, chosen]), axis=0).ravel()
+
+
+@dataclass(frozen=True, eq=False)
+class StateDependentController(PredictiveController):
+    """Predictive controller of a state-dependent plant.
+
+    Build it with ``sdp_integral_of_error`` or ``sdp_increments``.  Its ``model`` gives
+    sizes and names only.
+
+    Parameters
+    ----------
+    equation : StateDependentModel
+    settling : Settling
+    problem : Problem
+    offset_free : bool
+        Whether what the equation misses at this sample is expected to stay.
+    """
+
+    equation: StateDependentModel = field(kw_only=True)
+    settling: Settling = field(kw_only=True)
+    problem: Problem = field(kw_only=True)
+    offset_free: bool = field(kw_only=True, default=True)
+
+    def free_law(self) -> tuple[Array, Array]:
+        """Refuse: the law of a state-dependent plant is not linear."""
+        raise ValueError(NOT_LINEAR)
+
+    # The known vector: that of the program, then the plan and what is told of it.
+
+    @property
+    def _plan_layout(self) -> Layout:
+        return self.knowledge.layout
+
+    def _base(self, memory: Memory, r: Array, v: Array) -> Array:
+        """Known vectors (loops, n_theta) of the programs, offsets not yet along."""
+        known = self._known(memory.vector, r, v)
+        layout = self._plan_layout
+        known[:, layout["one"]] = 1.0
+        if self.offset_free:
+            load = missed_by(self.equation, self.form.recipe.layout, memory.vector)
+            known[:, layout["c"]] = np.tile(load, self.horizon.Np)
+        return known
+
+    def _expected(self, vector: Array) -> Array:
+        return expected(self.equation, self.form.recipe.layout, vector)
+
+    # Algorithm 8.3.1
+
+    def passes(
+        self, theta: Array, start: Point, settling: Settling | None = None
+    ) -> Iterator[Pass]:
+        """Pass after pass of Algorithm 8.3.1, without end.
+
+        Parameters
+        ----------
+        theta : array (n_theta,)
+            Known vector of the sample's program.
+        start : Point
+        settling : Settling, optional
+            In place of the design's own.
+        """
+        settling = settling or self.settling
+        before = theta[self.problem.known["u"]]
+        point, guess = start, None
+        while True:
+            solution, status = self._optimum(point, before, guess)
+            change = float(np.abs(solution.decision - point.z).max())
+            yield Pass(point, solution, status, change)
+            guess = solution.decision, solution.multipliers
+            point = self._following(point, solution, theta, settling)
+
+    def _optimum(
+        self, point: Point, before: Array, guess: tuple[Array, Array] | None
+    ) -> tuple[Solution, Status]:
+        """Optimum of the program of a point, limits looked at first."""
+        program, theta = point.program, point.theta
+        nothing = np.zeros(program.n_z), np.zeros(self.n_rows)
+        if not np.isfinite(point.cost):
+            told = "the predictions run away before any program can be made"
+            return Solution(*nothing, QPStatus.FAILED, message=told), Status.HELD
+        try:
+            z = -scipy.linalg.cho_solve(
+                scipy.linalg.cho_factor(program.H), program.f @ theta
+            )
+        except (np.linalg.LinAlgError, ValueError) as error:
+            return Solution(*nothing, QPStatus.FAILED, message=str(error)), Status.HELD
+        if (program.room(z, theta) >= -program.slack).all():
+            solution = Solution(z, np.zeros(self.n_rows), QPStatus.SOLVED)
+            return solution, Status.FREE
+        ranked = RankedProgram(program, self.ranks, self.limits, self.backend)
+        low, high = self._reachable(before)
+        open_ = np.isinf(program.lower) & np.isinf(program.upper)
+        bounds = np.where(open_, -np.inf, low), np.where(open_, np.inf, high)
+        return ranked.solve(theta, bounds, guess)
+
+    def _following(
+        self, point: Point, solution: Solution, theta: Array, settling: Settling
+    ) -> Point:
+        """Point of the next pass: a full, damped or halved step to the optimum."""
+        step = solution.decision - point.z
+        scheme = settling.scheme
+        if point.frozen or not np.isfinite(point.cost):
+            return self.problem.at(solution.decision, theta, scheme)
+        if scheme == "iterated":
+            share = 1.0 - settling.damping
+            return self.problem.at(point.z + share * step, theta, scheme)
+        price = 4.0 * np.abs(solution.multipliers[self.problem.on_outputs]).max(
+            initial=0.0
+        )
+        worst = point.cost + price * point.missed
+        for halved in range(12):
+            trial = self.problem.at(point.z + 0.5**halved * step, theta, scheme)
+            merit = trial.cost + price * trial.missed
+            if merit <= worst + 1e-12 * (1.0 + abs(worst)):
+                return trial
+        return trial
+
+    def start_of(
+        self, theta: Array, plan: Array | None, settling: Settling | None = None
+    ) -> Point:
+        """Where the passes of a sample begin.
+
+        Parameters
+        ----------
+        theta : array (n_theta,)
+        plan : array (Np, n_u), optional
+            Inputs from this sample on; without them the frozen model's optimum is the
+            first plan.
+        """
+        scheme = (settling or self.settling).scheme
+        if plan is not None and scheme != "frozen":
+            z = self.problem.from_inputs(self.kept_within(plan, theta), theta)
+            point = self.problem.at(z, theta, scheme)
+            if np.isfinite(point.cost):
+                return point
+        rest = np.tile(theta[self.problem.known["u"]], (self.horizon.Np, 1))
+        z = self.problem.from_inputs(rest, theta)
+        return self.problem.at(z, theta, "frozen")
+
+    def kept_within(self, plan: Array, theta: Array) -> Array:
+        """Plan (Np, n_u) clipped to the limits on inputs and rates, step by step."""
+        before, kept = theta[self.problem.known["u"]], plan.copy()
+        for i in range(len(plan)):
+            kept[i] = before = self.clip(plan[i], before)
+        return kept
+
+    def runaway(self, theta: Array) -> float:
+        """Size of predicted outputs from which on passes count as running away."""
+        known = np.abs(theta[self.problem.known["x"]]).max(initial=0.0)
+        return RUNAWAY * (1.0 + float(known))
+
+    def _settle(self, theta: Array, plan: Array | None) -> Outcome:
+        """Run passes until the plan stops moving, or something else ends them."""
+        began, settling = time.perf_counter(), self.settling
+        trace = Trace(settling)
+        runaway = self.runaway(theta)
+        for each in self.passes(theta, self.start_of(theta, plan)):
+            trace.take(each)
+            verdict = trace.verdict(runaway, time.perf_counter() - began)
+            if verdict is None:
+                continue
+            if verdict in (Status.UNSETTLED, Status.OUT_OF_TIME):
+                last = self._following(each.point, each.solution, theta, settling)
+                trace.consider(last)
+            return Outcome(verdict, each, trace.best, len(trace.changes), trace.ratio)
+        raise AssertionError("passes have no end")
+
+    def _decide(self, memory: Memory, r: Array, v: Array) -> Move:
+        known = self._base(memory, r, v)
+        loops, n_u = len(known), self.model.n_u
+        move = Move(
+            u=np.zeros((loops, n_u)),
+            w=r[:, 0].copy(),
+            governed=r[:, 0].copy(),
+            decision=np.zeros((loops, self.n_z)),
+            known=known,
+            status=np.full(loops, Status.FREE),
+            cost=np.zeros(loops),
+            multipliers=np.zeros((loops, self.n_rows)),
+            iterations=np.zeros(loops, dtype=int),
+            shift=np.zeros(loops, dtype=int),
+        )
+        for i in range(loops):
+            self._decide_one(move, memory, i)
+        return self._clipped(move, memory)
+
+    def _decide_one(self, move: Move, memory: Memory, i: int) -> None:
+        theta = move.known[i, : self.problem.known.size]
+        outcome = self._settle(theta, self._last_plan(memory, i))
+        move.iterations[i] = outcome.passes
+        if outcome.plan is None:
+            LOG.warning("%s", outcome.last.solution.message or outcome.status.sentence)
+            self._continue(move, memory, i, self.last_input(memory.vector[i]))
+            return
+        point, z = outcome.plan
+        layout, known = self._plan_layout, move.known[i]
+        U = self.problem.U.value(z, theta)
+        settled = outcome.status not in UNSETTLED
+        known[layout["plan_u"]] = U
+        known[layout["plan_du"]] = self.problem.dU.value(z, theta)
+        known[layout["plan_y"]] = (
+            point.Y.value(z, point.theta) if settled else point.y.ravel()
+        )
+        # no nan among what is known: plans are read from it by products
+        known[layout["contraction"]] = np.nan_to_num(outcome.ratio)
+        known[layout["change"]] = outcome.last.change
+        self._keep_law(known, point)
+        move.decision[i], move.u[i] = z, U[: self.model.n_u]
+        move.status[i] = self._told(outcome, z, theta)
+        move.cost[i] = point.cost
+        if settled:
+            move.multipliers[i] = outcome.last.solution.multipliers
+            if self.settling.scheme != "newton":  # its Hessian is not that of J
+                move.cost[i] = point.program.cost(z, point.theta)
+
+    def _told(self, outcome: Outcome, z: Array, theta: Array) -> Status:
+        """Status of a plan, and whether one of the opposite sign would do as well."""
+        if outcome.status in UNSETTLED:
+            return outcome.status
+        point, _ = outcome.plan  # type: ignore[misc]
+        if not np.abs(point.Y.gain).max() > 1e-9:
+            return Status.GUARDED
+        if self.settling.scheme != "frozen" and self._mirrored(point, z, theta):
+            return Status.AMBIGUOUS
+        return outcome.status
+
+    def _mirrored(self, point: Point, z: Array, theta: Array) -> bool:
+        """Whether inputs of the opposite sign are allowed and cost the same."""
+        U = self.problem.U.value(z, theta).reshape(self.horizon.Np, -1)
+        if np.abs(U).max() < 1e-6:
+            return False
+        before = theta[self.problem.known["u"]]
+        if np.abs(self.clip(-U[0], before) + U[0]).max() > 1e-9:
+            return False
+        other = self.problem.from_inputs(-U, theta)
+        if not np.allclose(self.kept_within(-U, theta), -U, atol=1e-9):
+            return False
+        twin = self.problem.at(other, theta, self.settling.scheme)
+        return bool(abs(twin.cost - point.cost) <= 1e-7 * (1.0 + abs(point.cost)))
+
+    def _last_plan(self, memory: Memory, i: int) -> Array | None:
+        """Give inputs of the last plan from this sample on, its last value repeated."""
+        if memory.shift[i] < 0 or not self.settling.warm_start:
+            return None
+        Np = self.horizon.Np
+        plan = memory.known[i, self._plan_layout["plan_u"]].reshape(Np, -1)
+        return plan[np.minimum(np.arange(Np) + 1 + memory.shift[i], Np - 1)]
+
+    def _clipped(self, move: Move, memory: Memory) -> Move:
+        clipped = self.clip(move.u, self.last_input(memory.vector))
+        cut = np.abs(clipped - move.u).max(axis=-1) > 1e-6
+        move.status[cut & (move.status < Status.CLIPPED)] = Status.CLIPPED
+        move.u[:] = clipped
+        return move
+
+    # The sum of the error follows the applied input by the law of the last program.
+
+    def _keep_law(self, known: Array, point: Point) -> None:
+        layout = self._plan_layout
+        if "law" not in layout or not np.isfinite(point.cost):
+            return
+        program, n_u, p = point.program, self.model.n_u, self.model.n_y
+        x = self.problem.known["x"]
+        right = np.column_stack(
+            [program.f @ point.theta, program.f[:, x.stop - p : x.stop]]
+        )
+        law = -np.linalg.solve(program.H, right)[:n_u]
+        known[layout["free_u"]], known[layout["law"]] = law[:, 0], law[:, 1:].ravel()
+
+    def _followed(self, memory: Memory, u: Array, move: Move) -> Array:
+        layout = self._plan_layout
+        if not self.anti_windup:
+            return memory.vector
+        free = layout.read(move.known, "free_u")
+        missed = np.where(self._overruled(u, free, move), u - free, 0.0)
+        law = layout.read(move.known, "law")
+        return follow(self.form.recipe.layout, memory.vector, missed, law)
+
+    def _balanced(self, vector: Array, y: Array, u: Array) -> Array:
+        layout, r = self._plan_layout, np.tile(y, (1, 1 + self.preview, 1))
+        for _ in range(30):
+            memory = Memory(*(np.asarray(p)[None] for p in _parts(self._fresh(vector))))
+            move = self._decide(memory, r, np.zeros((1, 1, 0)))
+            missed = u - layout.read(move.known[0], "free_u")
+            if np.abs(missed).max() < 1e-10 * (1.0 + np.abs(u).max()):
+                break
+            law = layout.read(move.known[0], "law")
+            vector = follow(self.form.recipe.layout, vector, missed, law)
+        return vector
+
+
+UNSETTLED = (Status.UNSETTLED, Status.OUT_OF_TIME, Status.CYCLED, Status.DIVERGED)
+"""Ways in which passes end without a plan that agrees with its predictions."""
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """How the passes of a sample ended.
+
+    Parameters
+    ----------
+    status : Status
+    last : Pass
+    best : Point, optional
+        The best plan that was met on the way.
+    passes : int
+    ratio : float
+        Contraction estimate: by which factor a pass makes the change smaller.
+    """
+
+    status: Status
+    last: Pass
+    best: Point | None
+    passes: int
+    ratio: float
+
+    @property
+    def plan(self) -> tuple[Point, Array] | None:
+        """Point and decision to apply; None when no plan was found."""
+        if self.status not in UNSETTLED:
+            found = self.last.solution.found
+            return (self.last.point, self.last.solution.decision) if found else None
+        return None if self.best is None else (self.best, self.best.z)
+
+
+class Trace:
+    """What the passes of a sample have shown so far."""
+
+    def __init__(self, settling: Settling) -> None:
+        self.settling = settling
+        self.changes: list[float] = []
+        self.plans: list[Array] = []
+        self.best: Point | None = None
+        self.last: Pass | None = None
+
+    def take(self, each: Pass) -> None:
+        """Note a pass."""
+        self.last = each
+        self.changes.append(each.change)
+        self.plans.append(each.point.z)
+        if not each.point.frozen:
+            self.consider(each.point)
+
+    def consider(self, point: Point) -> None:
+        """Keep the better of two plans: the lower cost among the least broken."""
+        if not np.isfinite(point.cost):
+            return
+        if self.best is None or _merit(point) < _merit(self.best):
+            self.best = point
+
+    @property
+    def ratio(self) -> float:
+        """Geometric mean of the last ratios of changes; nan before there are two."""
+        changes = [c for c in self.changes[-6:] if c > 0.0]
+        if len(changes) < 2:
+            return np.nan
+        return float((changes[-1] / changes[0]) ** (1.0 / (len(changes) - 1)))
+
+    def verdict(self, runaway: float, seconds: float) -> Status | None:
+        """Status if the passes should end here, None to go on."""
+        each = self.last
+        assert each is not None
+        point, settling = each.point, self.settling
+        if not each.solution.found:
+            return Status.DIVERGED if self.best is not None else Status.HELD
+        if settling.scheme == "frozen":
+            return each.status
+        small = settling.tolerance * (1.0 + np.abs(each.solution.decision).max())
+        if each.change <= small and not point.frozen:
+            return each.status
+        if not point.frozen and not np.abs(point.y).max() < runaway:
+            return Status.DIVERGED
+        if self._swings():
+            return Status.CYCLED
+        if len(self.changes) >= settling.passes:
+            return Status.UNSETTLED
+        return Status.OUT_OF_TIME if seconds > settling.seconds else None
+
+    def _swings(self) -> bool:
+        """Whether the last plans are two in turn, pass after pass."""
+        if len(self.plans) < 8:
+            return False
+        last = self.plans[-6:]
+        near = max(np.abs(b - a).max() for a, b in zip(last, last[2:], strict=False))
+        far = min(np.abs(b - a).max() for a, b in itertools.pairwise(last))
+        return bool(near < 1e-4 * far)
+
+
+def _merit(point: Point) -> tuple[float, float]:
+    return round(point.missed, 9), point.cost
+
+
+def sdp_integral_of_error(
+    model: StateDependentModel,
+    horizon: Horizon,
+    Q: Any,
+    R: Any,
+    limits: Limits | None = None,
+    reference: Reading = "held",
+    settling: Settling | None = None,
+    terminal: Terminal = "none",
+    backend: str = "daqp",
+    anti_windup: bool = True,
+) -> StateDependentController:
+    r"""Predictive control with an integral of the error, plant (8.1), thesis 8.3.
+
+    .. math:: J = X' \bar Q X + U' \bar R U
+
+    as in ``integral_of_error``, which it is when the coefficients are constant.
+
+    Parameters
+    ----------
+    model : StateDependentModel
+    horizon, limits, reference, backend : see ``integral_of_error``
+    Q : weight of the state [y_k ... y_{k-na+1}; u_{k-1} ... u_{k-nb+1}; sum of error]
+    R : weight of the inputs
+        Both in the ways of ``integral_of_error``; Q without negative eigenvalues, R
+        with positive ones, since the program is made anew at each pass.
+    settling : Settling, optional
+        Scheme, damping, tolerance and bounds; iterated with damping 0.5 by default.
+    terminal : "none" or "equality"
+    anti_windup : bool
+        While a level limit holds the input, set the sum of the error to what the law
+        of the last program needs for that input.
+
+    Raises
+    ------
+    ValueError
+        If a weight or limit has a wrong shape or sign, or an argument is unknown.
+    """
+    form = integral_of_error_form(model.wide)
+    kept = thesis_state(model, form.n_x)
+    weight_x = weight("Q", Q, horizon.Np, len(kept))
+    weight_u = weight("R", R, horizon.Nc, model.n_u)
+    _check_weights(weight_x, weight_u)
+    spread = np.kron(np.eye(horizon.Np), np.eye(form.n_x)[kept])
+    weight_x = spread.T @ weight_x @ spread
+    parts = model, form, horizon, reference, weight_x, weight_u
+    built = _build(*parts, limits, settling, terminal, backend, False, False)
+    return dataclasses.replace(built, anti_windup=anti_windup)
+
+
+def sdp_increments(
+    model: StateDependentModel,
+    horizon: Horizon,
+    Q: Any,
+    R: Any,
+    limits: Limits | None = None,
+    reference: Reading = "held",
+    settling: Settling | None = None,
+    terminal: Terminal = "none",
+    backend: str = "daqp",
+    offset_free: bool = True,
+) -> StateDependentController:
+    r"""Predictive control by changes of the input, plant (8.1), thesis 8.4.
+
+    .. math:: J = (Y - S)' \bar Q (Y - S) + \Delta U' \bar R \Delta U
+
+    Parameters
+    ----------
+    Q, R : weights of outputs and of moves, in the ways of ``wang_young``
+        Q without negative eigenvalues, R with positive ones.
+    offset_free : bool
+        Whether the difference between y_k and what the equation gives for it is
+        expected to stay, which removes the offset after constant disturbances and, with
+        constant coefficients, makes it ``wang_young``.  The thesis predicts without.
+    model, horizon, limits, reference, settling, terminal, backend :
+        See ``sdp_integral_of_error``.
+
+    Raises
+    ------
+    ValueError
+        As ``sdp_integral_of_error``.
+    """
+    if reference == "zero":
+        raise ValueError(
+            'reference = "zero" leaves nothing to follow: use "held", "next" or '
+            '"preview"'
+        )
+    form = past_form(model.wide)
+    weight_y = weight("Q", Q, horizon.Np, model.n_y)
+    weight_du = weight("R", R, horizon.Nc, model.n_u)
+    _check_weights(weight_y, weight_du)
+    parts = model, form, horizon, reference, weight_y, weight_du
+    return _build(*parts, limits, settling, terminal, backend, True, offset_free)
+
+
+SDP_STRUCTURES: dict[str, Callable[..., StateDependentController]] = {
+    "sdp_integral_of_error": sdp_integral_of_error,
+    "sdp_increments": sdp_increments,
+}
+"""Predictive structures for state-dependent models, by name."""
+
+
+def _build(
+    model: StateDependentModel,
+    form: Form,
+    horizon: Horizon,
+    reference: Reading,
+    weight_x: Array,
+    weight_z: Array,
+    limits: Limits | None,
+    settling: Settling | None,
+    terminal: Terminal,
+    backend: str,
+    increments: bool,
+    offset_free: bool,
+) -> StateDependentController:
+    if terminal not in ("none", "equality"):
+        raise ValueError(f'terminal = "{terminal}": expected "none" or "equality"')
+    find_backend(backend)
+    limits = limits or Limits()
+    setup = Setup(
+        model.wide, form, horizon, reference, c=(horizon.Np, model.n_y), one=1
+    )
+    problem = Problem(model, setup, weight_x, weight_z, increments, limits, terminal)
+    knowledge = _knowledge(setup, not increments)
+    layout, n_z = knowledge.layout, setup.n_z
+    signals = {
+        name: known_part(layout, f"plan_{name}", n_z) for name in ("u", "du", "y")
+    }
+    return StateDependentController(
+        model.wide,
+        form,
+        limits,
+        horizon,
+        problem.template,
+        signals,
+        knowledge,
+        output_ranks(problem.template, limits, model.n_y),
+        backend,
+        equation=model,
+        settling=settling or Settling(),
+        problem=problem,
+        offset_free=offset_free,
+    )
+
+
+def _knowledge(setup: Setup, integral: bool) -> Knowledge:
+    """Known vector of the program, followed by the plan and what is told of it."""
+    base, Np = setup.knowledge(), setup.horizon.Np
+    p, q = setup.model.n_y, setup.model.n_u
+    parts: dict[str, Any] = {
+        "plan_u": (Np, q),
+        "plan_du": (Np, q),
+        "plan_y": (Np, p),
+        "contraction": 1,
+        "change": 1,
+    }
+    if integral:
+        parts |= {"free_u": q, "law": (q, p)}
+    layout = Layout(**base.layout.shapes, **parts)
+    room = ((0, layout.size - base.layout.size), (0, 0))
+    return Knowledge(
+        layout,
+        np.pad(base.from_memory, room),
+        np.pad(base.from_r, room),
+        np.pad(base.from_v, room),
+    )
+
+
+def _check_weights(weight_x: Array, weight_z: Array) -> None:
+    for name, matrix, least in (("Q", weight_x, -1e-12), ("R", weight_z, 1e-12)):
+        smallest = float(np.linalg.eigvalsh(matrix)[0])
+        if smallest < least * max(1.0, np.abs(matrix).max()):
+            wanted = "not be negative" if name == "Q" else "be positive"
+            raise ValueError(
+                f"{name} has the eigenvalue {smallest:.4g}; all of them must {wanted}"
+            )
+
+
+def _parts(record: Memory) -> list[Array]:
+    return [getattr(record, part.name) for part in dataclasses.fields(record)]
