@@ -126,6 +126,26 @@ export function render({ model, el }) {
     return [element("label", { for: id }, item.label), input]
   }
 
+  const text = (item, id) => {
+    const input = element("input", {
+      type: "text", id, name: item.name, "aria-describedby": id + "-help",
+      maxlength: item.longest, spellcheck: "false", autocomplete: "off",
+    })
+    update[item.name] = (value) => { if (!(item.name in typing)) input.value = value }
+    if (item.name in typing) input.value = typing[item.name]
+    input.addEventListener("input", () => { typing[item.name] = input.value })
+    const enter = () => {
+      if (building || !(item.name in typing)) return
+      const value = typing[item.name]
+      delete typing[item.name]
+      choose(item.name, value)
+    }
+    input.addEventListener("change", enter)
+    input.addEventListener("blur", enter)
+    input.addEventListener("keydown", (event) => { if (event.key === "Enter") enter() })
+    return [element("label", { for: id }, item.label), input]
+  }
+
   const several = (item, id) => {
     const group = element("fieldset", { "aria-describedby": id + "-help" })
     group.append(element("legend", {}, item.label))
@@ -169,8 +189,10 @@ export function render({ model, el }) {
       for (const item of group.items) {
         items[item.name] = JSON.stringify(item)
         const id = `choice-${item.name}`
-        const make = { one: select, several, number: typed }[item.kind] ?? slider
-        const kind = { one: "one", several: "several", number: "field" }[item.kind] ?? "slider"
+        const make = { one: select, several, number: typed, text }[item.kind] ?? slider
+        const kind = {
+          one: "one", several: "several", number: "field", text: "text",
+        }[item.kind] ?? "slider"
         const help = element("p", { id: id + "-help", class: "help" })
         help.textContent = item.help
         const choice = element("div", { class: `choice ${kind}` }, ...make(item, id), help)
@@ -198,6 +220,11 @@ export function render({ model, el }) {
       form.querySelector(`[data-name="${name}"]`).classList.toggle("idle", Boolean(idle))
     }
   }
+
+  // A player may ask to look into a sample
+  const look = (event) => { if (update.inside) choose("inside", event.detail) }
+  window.addEventListener("nmss-look", look)
+  model.on("remove", () => window.removeEventListener("nmss-look", look))
 
   let stale = false
   model.on("form", () => { stale = true })

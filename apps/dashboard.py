@@ -7,9 +7,10 @@ from collections.abc import Callable
 import panel as pn
 from panel.viewable import Viewable
 
-from apps.pages import governor, identify, receding_horizon
+from apps.pages import governor, identify, receding_horizon, state_dependent
 from apps.pages.live import Subject, page_template, text_style
 from apps.session import known_case
+from nmss_lab.cases import CASES
 
 THREADS = 4
 
@@ -27,6 +28,9 @@ every limit.</a>
 <a class="card" href="identify"><b>Identify</b>
 From a record, shipped or your own, to a ranked table of models with honest
 uncertainty, and from there to a controller.</a>
+<a class="card" href="state_dependent"><b>State-dependent control</b>
+Plants whose coefficients move with the plan: watch predictions settle, swing or run
+away, over time and pass by pass within one sample, beside the true optimum.</a>
 </div>
 <h2>Start from an example</h2>
 """
@@ -35,7 +39,7 @@ uncertainty, and from there to a controller.</a>
 def index() -> pn.Template:
     """Build the page that leads to the others."""
     page = page_template("", "Predictive control in the non-minimal state space")
-    subjects = (receding_horizon.SUBJECT, governor.SUBJECT)
+    subjects = (receding_horizon.SUBJECT, governor.SUBJECT, state_dependent.SUBJECT)
     lists = "".join(_examples(subject) for subject in subjects)
     text = pn.pane.HTML(
         INDEX + lists, stylesheets=[text_style()], sizing_mode="stretch_width"
@@ -50,6 +54,7 @@ def _examples(subject: Subject) -> str:
         f'<dt><a href="{subject.path}?case={name}">{html.escape(title)}</a></dt>'
         f"<dd>{html.escape(subject.look[name])}</dd>"
         for name in subject.choices.cases()
+        if name in CASES
         for title in [known_case(name).title]
     )
     return f"<h3>{html.escape(subject.heading)}</h3><dl>{entries}</dl>"
@@ -69,4 +74,5 @@ def pages() -> dict[str, Callable[[], Viewable]]:
         "receding_horizon": receding_horizon.page,
         "governor": governor.page,
         "identify": identify.page,
+        "state_dependent": state_dependent.page,
     }

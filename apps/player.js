@@ -23,6 +23,7 @@ const icon = (name) => {
 
 export function render({ model, el }) {
   let run = model.run
+  const place = model.place   // where its words go, and what its samples are called
   let time = run.start      // in samples, with a fraction while playing
   let playing = false
   let before = 0
@@ -49,24 +50,26 @@ export function render({ model, el }) {
     status.setAttribute("aria-live", on ? "off" : "polite")
     if (on && time >= last()) time = 0
     toggle.replaceChildren(icon(on ? "pause" : "play"))
-    const label = on ? "Pause (space)" : "Play (space)"
+    const label = (on ? "Pause" : "Play") + hint("space")
     toggle.setAttribute("aria-label", label)
     toggle.title = label
     before = performance.now()
     request()
   }
   const step = (by) => { play(false); go(Math.floor(time + 1e-9) + by) }
-  const toggle = button("play", "Play (space)", () => play(!playing))
+  const hint = (key) => place.keys ? ` (${key})` : ""
+  const toggle = button("play", "Play" + hint("space"), () => play(!playing))
   toggle.classList.add("main")
   const scrub = element("input", {
-    type: "range", min: 0, max: last(), step: 1, "aria-label": "Sample", name: "sample",
+    type: "range", min: 0, max: last(), step: 1, "aria-label": place.noun,
+    name: place.noun.toLowerCase(),
   })
   scrub.addEventListener("input", () => { play(false); go(Number(scrub.value)) })
   const clock = element("output", { class: "clock", "aria-live": "off" })
-  const speed = element("select", { "aria-label": "Speed", title: "Samples a second" })
+  const speed = element("select", { "aria-label": "Speed", title: "Steps a second" })
   for (const rate of [1, 2, 5, 10, 20, 50]) {
-    const option = element("option", { value: rate }, `${rate} samples/s`)
-    option.selected = rate === 10
+    const option = element("option", { value: rate }, `${rate} ${place.plural}/s`)
+    option.selected = rate === place.rate
     speed.append(option)
   }
   const check = (name, text, on) => {
@@ -76,18 +79,28 @@ export function render({ model, el }) {
     return [box, element("label", { class: "check" }, box, text)]
   }
   const [loop, loopLabel] = check("loop", "Loop", true)
-  const [fan, fanLabel] = check("fan", "Past plans", false)
-  const status = document.getElementById("status")
+  const [fan, fanLabel] = check("fan", place.past, false)
+  const status = document.getElementById(place.status)
+  const looking = []  // a page that can look into a sample gets a button for it
+  if (place.keys && document.getElementById("inside")) {
+    const look = element("button", { type: "button", class: "look" }, "Look into this sample")
+    look.addEventListener("click", () => {
+      play(false)
+      const detail = Math.floor(time + 1e-9)
+      window.dispatchEvent(new CustomEvent("nmss-look", { detail }))
+    })
+    looking.push(look)
+  }
   el.append(
-    element("div", { class: "playbar", role: "group", "aria-label": "Player" },
+    element("div", { class: "playbar", role: "group", "aria-label": place.label },
       element("div", { class: "buttons" },
-        button("first", "To the start (Home)", () => { play(false); go(0) }),
-        button("back", "One sample back (left arrow)", () => step(-1)),
+        button("first", "To the start" + hint("Home"), () => { play(false); go(0) }),
+        button("back", "One step back" + hint("left arrow"), () => step(-1)),
         toggle,
-        button("forward", "One sample on (right arrow)", () => step(1)),
-        button("last", "To the end (End)", () => { play(false); go(last()) })),
+        button("forward", "One step on" + hint("right arrow"), () => step(1)),
+        button("last", "To the end" + hint("End"), () => { play(false); go(last()) })),
       scrub, clock,
-      element("div", { class: "options" }, speed, loopLabel, fanLabel)))
+      element("div", { class: "options" }, speed, loopLabel, fanLabel, ...looking)))
 
   const keys = (event) => {
     const at = event.composedPath()[0]
@@ -99,7 +112,7 @@ export function render({ model, el }) {
     }[event.key]
     if (action) { event.preventDefault(); action() }
   }
-  document.addEventListener("keydown", keys)
+  if (place.keys) document.addEventListener("keydown", keys)
 
   // The picture
 
@@ -140,8 +153,12 @@ export function render({ model, el }) {
     context.fill()
   }
 
-  const trace = (context, curve, k, X, Y, dt) => {
-    const data = run.data, t0 = data[k] + curve.ahead * dt
+  // Trails set out from their sample, or are versions of one prediction
+  const beginning = (chart, curve, k, dt) =>
+    chart.origin ?? run.data[k] + curve.ahead * dt
+
+  const trace = (context, chart, curve, k, X, Y, dt) => {
+    const data = run.data, t0 = beginning(chart, curve, k, dt)
     const from = curve.start + k * curve.steps
     context.beginPath()
     if (curve.present !== null) context.moveTo(X(data[k]), Y(data[curve.present + k]))
@@ -162,13 +179,14 @@ export function render({ model, el }) {
     const b = box.height / (y_range.end - y_range.start)
     const X = (t) => box.left + (t - x_range.start) * a
     const Y = (v) => box.bottom - (v - y_range.start) * b
-    const dt = run.data[1] - run.data[0]
+    const still = chart.origin !== null
+    const dt = still ? chart.step : run.data[1] - run.data[0]
     const now = run.data[0] + time * dt
     context.save()
     context.beginPath()
     context.rect(box.left, box.top, box.width, box.height)
     context.clip()
-    const x = X(now)
+    const x = still ? box.left : X(now)
     context.globalAlpha = 0.82
     context.fillStyle = colors.paper
     context.fillRect(x, box.top, box.right - x, box.height)
@@ -178,33 +196,37 @@ export function render({ model, el }) {
       context.globalAlpha = 0.16
       for (const curve of chart.trails) {
         context.strokeStyle = colors.styles[curve.style]
-        for (let past = 0; past < k; past++) trace(context, curve, past, X, Y, dt)
+        for (let past = 0; past < k; past++) trace(context, chart, curve, past, X, Y, dt)
       }
     }
     context.globalAlpha = 1
     for (const curve of chart.trails) {
       context.strokeStyle = context.fillStyle = colors.styles[curve.style]
       context.lineWidth = 1.4
-      trace(context, curve, k, X, Y, dt)
-      const t0 = run.data[k] + curve.ahead * dt, from = curve.start + k * curve.steps
+      trace(context, chart, curve, k, X, Y, dt)
+      const t0 = beginning(chart, curve, k, dt), from = curve.start + k * curve.steps
       const radius = Math.min(3.2, Math.max(1.6, a * dt / 4))
       for (let i = 0; i < curve.steps; i++) {
         marker(context, curve.style, X(t0 + i * dt), Y(run.data[from + i]), radius)
       }
     }
-    context.strokeStyle = colors.ink
-    context.lineWidth = 1
-    context.globalAlpha = 0.7
-    context.beginPath()
-    context.moveTo(Math.round(x) + 0.5, box.top)
-    context.lineTo(Math.round(x) + 0.5, box.bottom)
-    context.stroke()
+    if (!still) {
+      context.strokeStyle = colors.ink
+      context.lineWidth = 1
+      context.globalAlpha = 0.7
+      context.beginPath()
+      context.moveTo(Math.round(x) + 0.5, box.top)
+      context.lineTo(Math.round(x) + 0.5, box.bottom)
+      context.stroke()
+    }
     context.restore()
   }
 
   const describe = (k) => {
     const time_ = run.data[k]
-    clock.textContent = `sample ${k} \u00b7 ${Number(time_.toPrecision(4))} ${run.unit}`
+    const noun = place.noun.toLowerCase()
+    clock.textContent = run.unit === "-" ? `${noun} ${k + 1} of ${run.samples}`
+      : `${noun} ${k} \u00b7 ${Number(time_.toPrecision(4))} ${run.unit}`
     scrub.value = k
     scrub.max = last()
     scrub.style.setProperty("--share", `${100 * k / Math.max(last(), 1)}%`)
@@ -288,7 +310,7 @@ export function render({ model, el }) {
     limits.forEach((side, i) => quietly(side, { location: chart.limits[i] }))
     quietly(plot.y_range, { start: chart.vertical[0], end: chart.vertical[1] })
     quietly(plot.left[0], { axis_label: chart.axis })
-    quietly(plot.below[0], { axis_label: `time [${run.unit}]` })
+    quietly(plot.below[0], { axis_label: `${chart.across} [${chart.unit}]` })
     quietly(plot.title, { text: chart.title })
     const [start, end] = chart.span
     if (plot.x_range.reset_start !== start || plot.x_range.reset_end !== end) {
@@ -305,7 +327,7 @@ export function render({ model, el }) {
     request()
   })
   window.addEventListener("nmss-theme", theme)
-  window.nmssPlayer = statistics  // for tests and measurements
+  window[place.statistics] = statistics  // for tests and measurements
   words()
   find()
   model.on("remove", () => {

@@ -39,13 +39,52 @@ class Controls(JSComponent):
     _debounce = 0  # the form itself sends one message at a time
 
 
+LOOP = {
+    "status": "status",
+    "statistics": "nmssPlayer",
+    "label": "Player",
+    "noun": "Sample",
+    "plural": "samples",
+    "past": "Past plans",
+    "rate": 10,
+    "keys": True,
+}
+"""Words and places of the player of a loop."""
+
+INSIDE = {
+    "status": "inside",
+    "statistics": "nmssInside",
+    "label": "Passes within the sample",
+    "noun": "Pass",
+    "plural": "passes",
+    "past": "Earlier passes",
+    "rate": 5,
+    "keys": False,
+}
+"""The same of the player of the passes within a sample."""
+
+
 class Player(JSComponent):
     """Moves through a run that was sent once; see ``moving``."""
 
     run = param.Dict(default={})
+    place = param.Dict(default=LOOP)
 
     _esm = script("player.js")
     _stylesheets = (STYLE,)
+
+
+def stepping(charts: Sequence[Chart], words: list[dict[str, Any]]) -> dict[str, Any]:
+    """Gather what a player needs to step through versions of one prediction.
+
+    Parameters
+    ----------
+    charts : sequence of Chart
+        The first one runs over the steps.
+    words : list
+        For each curve a "name", "texts", and "which" of them each step shows.
+    """
+    return {**pack(charts), "words": words, "start": 0, "fresh": True}
 
 
 def moving(

@@ -75,7 +75,14 @@ def plain(name: str) -> str:
         "integral_of_error_b": "Integral of error, weights b",
         "disturbance_direct": "Disturbance, direct",
         "disturbance_augmented": "Disturbance, augmented",
+        "gauss_newton": "Gauss-Newton",
+        "sdp_pip": "PIP, gain per sample",
+        "sdp_pip_naive": "PIP, naive increments",
+        "sdp_governor": "PIP with governor",
     }
+    scheme = name.removeprefix("integral_")
+    if scheme in ("frozen", "iterated", "gauss_newton", "newton") and scheme != name:
+        return f"{plain(scheme)}, integral of error"
     return special.get(name, name.replace("_", " ").capitalize())
 
 
@@ -268,11 +275,14 @@ class Choices(Form):
     @property
     def example(self) -> Case:
         """The chosen case."""
-        return known_case(self.case)
+        return self._case_of(self.case)
+
+    def _case_of(self, name: str) -> Case:
+        return known_case(name)
 
     def take_case(self, name: str) -> None:
         """Choose a case and put every other choice where the case has it."""
-        example = known_case(name)
+        example = self._case_of(name)
         for key, parameter in self.param.objects("existing").items():
             if key not in ("name", "case"):
                 setattr(self, key, parameter.default)

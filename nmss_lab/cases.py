@@ -1183,7 +1183,7 @@ def conical_tank() -> Case:
     limits = Limits(u=(0.0, 800.0), du=(-60.0, 60.0), y=(12.0, 75.0), outputs="soft")
     design = Design("sdp_increments", model, Horizon(20, 5), 1.0, 1e-3, limits)
     start = 20.0
-    steps = (0, start), (5, 40.0), (60, 60.0), (120, 18.0)
+    steps = (0, start), (5, 40.0), (40, 60.0), (75, 18.0)
     return Case(
         name="conical_tank",
         title="Conical tank",
@@ -1192,7 +1192,7 @@ def conical_tank() -> Case:
         plant=model.plant(),
         designs=_schemes(design),
         scenario=Scenario(
-            piecewise(180, *steps), y0=start, u0=60.0 * float(np.sqrt(start))
+            piecewise(120, *steps), y0=start, u0=60.0 * float(np.sqrt(start))
         ),
         notes=(
             "Balance of volume, stepped explicitly every 5 s: area * level^2 times "
@@ -1237,7 +1237,7 @@ def stirred_reactor() -> Case:
         rate = 7.2e10 * np.exp(-8750.0 / temperature)
         return float(1.0 / (1.0 + rate)), temperature
 
-    steps = (0, rest(350.0)), (5, rest(360.0)), (60, rest(340.0))
+    steps = (0, rest(350.0)), (5, rest(360.0)), (45, rest(340.0))
     c, T = rest(350.0)
     made = 5e4 / 239.0 * (1.0 - c)
     cool = T - (350.0 - T + made) / (5e4 / (100.0 * 239.0))
@@ -1249,7 +1249,7 @@ def stirred_reactor() -> Case:
         "min, E/R = 8750 K, -dH = 5e4 J/mol, rho cp = 239 J/(L K), UA = 5e4 J/(min K)",
         plant=model.plant(),
         designs=_schemes(design),
-        scenario=Scenario(piecewise(120, *steps), y0=np.array([c, T]), u0=cool),
+        scenario=Scenario(piecewise(90, *steps), y0=np.array([c, T]), u0=cool),
         notes=(
             "Balances of mass and heat, stepped every 0.05 min, implicitly where they "
             "are linear; constant terms are carried by 1/c and 1/T.",
@@ -1257,6 +1257,55 @@ def stirred_reactor() -> Case:
             "where it comes to rest.",
             "At 350 K the reactor is unstable: without control it cools down or runs "
             "away.",
+        ),
+    )
+
+
+def equation_case(
+    model: StateDependentModel, target: float = 1.0, samples: int = 60
+) -> Case:
+    """Case of any state-dependent equation with one input and one output.
+
+    Parameters
+    ----------
+    model : StateDependentModel
+    target : float
+        Reference from sample 5 on.
+    samples : int
+
+    Raises
+    ------
+    ValueError
+        If the model has several inputs or outputs, or is not finite at its start.
+    """
+    if (model.n_y, model.n_u) != (1, 1):
+        raise ValueError(
+            f"the model has {model.n_y} outputs and {model.n_u} inputs, expected one "
+            "of each"
+        )
+    u0 = 0.1
+    try:
+        y0 = float(model.rest(u0, 0.5)[0])
+    except ValueError:
+        y0 = 0.5
+    model.frozen(np.full((model.y_lags, 1), y0), np.full((model.u_lags, 1), u0))
+    moves = Design("sdp_increments", model, Horizon(10, 4), 1.0, 0.1)
+    levels = dataclasses.replace(moves, structure="sdp_integral_of_error")
+    size = (model.na + 1) + (model.nb - 1)
+    levels = dataclasses.replace(levels, Q=(1.0,) + (0.0,) * (size - 2) + (0.1,))
+    return Case(
+        name="own",
+        title="Your own equation",
+        section="",
+        source="Typed",
+        plant=model.plant(),
+        designs={**_schemes(moves), **_schemes(levels, "integral_")},
+        scenario=Scenario(piecewise(samples, (0, y0), (5, target)), y0=y0, u0=u0),
+        notes=(
+            "It starts with u = 0.1, at the rest nearest to y = 0.5 if there is one.",
+            "Weights are 1 on the output and 0.1 on moves; with an integral 1 on the "
+            "present output, 0.1 on the sum of the error and 0.1 on the input.",
+            "The plant obeys the equation exactly.",
         ),
     )
 

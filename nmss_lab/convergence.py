@@ -33,7 +33,7 @@ TRUE: Scheme = "gauss-newton"
 
 @dataclass(frozen=True, eq=False)
 class Iterate:
-    """One pass within a sample.
+    """One pass within a sample; of the frozen scheme also the plan it leads to.
 
     Parameters
     ----------
@@ -223,8 +223,12 @@ def iterates(run: Run, k: int, settling: Settling | None = None) -> list[Iterate
         status = each.status if verdict is None else verdict
         true = sample.at(point.z).cost
         found.append(Iterate(point.U, point.y, true, each.change, status, point.frozen))
-        if verdict is not None:
-            return found
+        if verdict is None:
+            continue
+        if settling.scheme == "frozen" and each.solution.found:
+            last = sample.at(each.solution.decision)
+            found.append(Iterate(last.U, last.y, last.cost, each.change, status, True))
+        return found
     raise AssertionError("passes have no end")
 
 

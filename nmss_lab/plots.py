@@ -31,6 +31,7 @@ from bokeh.models import (
 from bokeh.plotting import figure
 
 from nmss_lab.controller import Status
+from nmss_lab.convergence import Best, Iterate
 from nmss_lab.identify import Estimate, pole_draws, step_band, step_response
 from nmss_lab.models import Array
 from nmss_lab.predictive import PredictiveController
@@ -80,6 +81,8 @@ class Curve:
         Band of uncertainty about the values.
     marks : int
         More than 0: drawn as points, this many of the first ones large.
+    flags : bool array (M,), optional
+        Values marked with a cross.
     """
 
     label: str
@@ -93,6 +96,15 @@ class Curve:
     low: Array | None = None
     high: Array | None = None
     marks: int = 0
+    flags: Array | None = None
+
+    @property
+    def flagged(self) -> Curve | None:
+        """The marked values alone, as a curve."""
+        if self.flags is None:
+            return None
+        t, values = self.t[self.flags], self.values[self.flags]
+        return Curve(self.label, t, values, style=self.style)
 
     @property
     def reach(self) -> Array:
@@ -125,6 +137,11 @@ class Chart:
         Whether values are whole numbers.
     across : str
         What lies on the horizontal axis.
+    log : bool
+        Whether the vertical axis is logarithmic.
+    origin, step : float, optional
+        Where trails begin and how far their values are apart, if trails do not move
+        with the samples but are versions of one prediction.
     """
 
     name: str
@@ -137,6 +154,9 @@ class Chart:
     unit: str = "s"
     counts: bool = False
     across: str = "time"
+    log: bool = False
+    origin: float | None = None
+    step: float | None = None
 
     @property
     def span(self) -> tuple[float, float]:
@@ -153,6 +173,8 @@ class Chart:
         curves = (*self.curves, *self.references)
         values = np.concatenate([np.zeros(0), *(c.reach for c in curves)])
         values = values if values.size else np.zeros(1)
+        if self.log:
+            return _decades(values[values > 0.0])
         low, high = float(values.min()), float(values.max())
         if self.counts:
             low, high = 0.0, max(high, 1.0)
@@ -253,6 +275,200 @@ def governor_charts(
         (Curve("zero", t, np.zeros(len(t)), held=True),),
     )
     return [*plain, *(_timed(chart, governed) for chart in (reference, beta))]
+
+
+def varying_charts(
+    runs: Mapping[str, Run], output: int = 0, input: int = 0
+) -> list[Chart]:
+    """Charts of loops with state-dependent plants, unsettled samples crossed.
+
+    Returns
+    -------
+    list of Chart
+        Those of ``loop_charts``, with the decrease of the cost and the number of
+        programs a sample in the place of the active limits.
+
+    Raises
+    ------
+    ValueError
+        As ``loop_charts``.
+    """
+    charts = loop_charts(runs, output, input)
+    first = next(iter(runs.values()))
+    passes = _curves(runs, lambda run: run.iterations.astype(float))
+    last = Chart(
+        "passes", "Programs solved a sample", "number [-]", passes, counts=True
+    )
+    decrease = Chart(
+        "decrease",
+        "Decrease of the cost",
+        "before \u2212 now [-]",
+        _curves(runs, lambda run: -np.diff(run.cost, prepend=run.cost[:1])),
+        (Curve("zero", first.t, np.zeros(len(first))),),
+    )
+    charts[-1:] = [_timed(decrease, first), _timed(last, first)]
+    flags = [run.status > Status.AMBIGUOUS for run in runs.values()]
+    return [_flagged(c, flags) if c.name in FLAGGED else c for c in charts]
+
+
+FLAGGED = "output", "cost", "passes"
+"""Charts in which samples that did not settle are crossed."""
+
+
+def _flagged(chart: Chart, flags: Sequence[Array]) -> Chart:
+    curves = tuple(
+        dataclasses.replace(curve, flags=flags[curve.style]) for curve in chart.curves
+    )
+    return dataclasses.replace(chart, curves=curves)
+
+
+def inside_charts(
+    passes: Mapping[str, Sequence[Iterate]],
+    best: Best,
+    run: Run,
+    k: int,
+    output: int = 0,
+    input: int = 0,
+) -> list[Chart]:
+    """Charts of the passes within one sample, and the best plan of the true problem.
+
+    Parameters
+    ----------
+    passes : mapping of str to sequence of Iterate
+        Up to three ways to settle, by name.
+    best : Best
+    run : Run
+        Gives names, units and times; its controller's horizon is that of the plans.
+    k : int
+        The sample.
+    output, input : int
+        Which channels are shown.
+
+    Returns
+    -------
+    list of Chart
+        Named "change" and "gap", over the passes, and "inside_output" and
+        "inside_input", over the horizon, with one trail a pass.
+    """
+    model = run.controller.model
+    y, u = model.y_names[output], model.u_names[input]
+    in_y, in_u = (_unit(model.units.get(name, "")) for name in (y, u))
+    seconds, unit = time_unit(run)
+    count = max(len(found) for found in passes.values())
+    numbers = 1.0 + np.arange(float(max(count, 2)))
+    step = (run.t[1] - run.t[0]) / seconds
+    t = run.t[k] / seconds + step * np.arange(len(best.y) + 1)
+    change = Chart(
+        "change",
+        "Way from the plan to the program\u2019s optimum",
+        f"{u}{in_u}",
+        tuple(
+            Curve(name, numbers[: len(found)], _changes(found), style=style)
+            for style, (name, found) in enumerate(passes.items())
+        ),
+        samples=numbers,
+        unit="-",
+        across="pass",
+        log=True,
+    )
+    gap = Chart(
+        "gap",
+        "True cost above the lowest found",
+        "share of it [-]",
+        tuple(
+            Curve(name, numbers[: len(found)], _gaps(found, best), style=style)
+            for style, (name, found) in enumerate(passes.items())
+        ),
+        samples=numbers,
+        unit="-",
+        across="pass",
+        log=True,
+    )
+    trails = {
+        name: [[getattr(each, signal) for each in found] for signal in ("y", "u")]
+        for name, found in passes.items()
+    }
+    inside = []
+    for name, title, axis, which, channel, ahead in (
+        ("inside_output", "Predicted output, pass by pass", f"{y}{in_y}", 0, output, 1),
+        ("inside_input", "Planned input, pass by pass", f"{u}{in_u}", 1, input, 0),
+    ):
+        lowest = (best.y, best.u)[which][:, channel]
+        curves = tuple(
+            _last_with_trail(
+                label, t[ahead:], parts[which], channel, style, len(numbers)
+            )
+            for style, (label, parts) in enumerate(trails.items())
+        )
+        times = t[ahead : ahead + len(lowest)]
+        inside.append(
+            Chart(
+                name,
+                title,
+                axis,
+                tuple(dataclasses.replace(c, held=not ahead) for c in curves),
+                (Curve("lowest cost found", times, lowest, held=not ahead),),
+                samples=t,
+                unit=unit,
+                origin=float(t[ahead]),
+                step=float(step),
+            )
+        )
+    return [change, gap, *inside]
+
+
+def _changes(found: Sequence[Iterate]) -> Array:
+    """Take the change of each pass, above zero for a logarithmic axis."""
+    return np.maximum([each.change for each in found], 1e-16)
+
+
+def _gaps(found: Sequence[Iterate], best: Best) -> Array:
+    costs = np.array([each.cost for each in found])
+    gaps = (costs - best.cost) / max(abs(best.cost), 1e-300)
+    return np.clip(np.nan_to_num(gaps, posinf=1e6), 1e-12, 1e6)
+
+
+def _last_with_trail(
+    label: str,
+    t: Array,
+    plans: Sequence[Array],
+    channel: int,
+    style: int,
+    count: int,
+) -> Curve:
+    """Curve of the last pass; the trails of all, the last one repeated.
+
+    Its band is what the passes cover, but for those far away.
+    """
+    trail = np.array([plan[:, channel] for plan in plans])
+    trail = trail[np.minimum(np.arange(count), len(trail) - 1)]
+    trail = np.clip(trail, -1e30, 1e30)
+    for i in range(1, trail.shape[1]):  # what is no number any more stays where it was
+        trail[:, i] = np.where(np.isfinite(trail[:, i]), trail[:, i], trail[:, i - 1])
+    trail = np.nan_to_num(trail)
+    last = trail[-1]
+    room = 2.0 * np.ptp(last)
+    low = np.maximum(trail.min(axis=0), last.min() - room)
+    high = np.minimum(trail.max(axis=0), last.max() + room)
+    t = t[: len(last)]
+    return Curve(label, t, last, style=style, trail=trail, low=low, high=high)
+
+
+def passes_in_words(passes: Mapping[str, Sequence[Iterate]]) -> list[dict[str, Any]]:
+    """Words about each pass of each way to settle, as a player shows them."""
+    count = max(2, max(len(found) for found in passes.values()))
+    words = []
+    for name, found in passes.items():
+        texts = [_pass_in_words(i, each, found) for i, each in enumerate(found)]
+        which = np.minimum(np.arange(count), len(found) - 1)
+        words.append({"name": name, "texts": texts, "which": which.tolist()})
+    return words
+
+
+def _pass_in_words(i: int, each: Iterate, found: Sequence[Iterate]) -> str:
+    where = "with the coefficients of this sample" if each.frozen else "along the plan"
+    text = f"Pass {i + 1} {where}: cost {each.cost:.6g}, change {each.change:.2g}."
+    return f"{text} {each.status.sentence}" if i == len(found) - 1 else text
 
 
 # Estimates
@@ -557,6 +773,14 @@ def _check(runs: Mapping[str, Run], output: int, input: int) -> Run:
     return first
 
 
+def _decades(values: Array) -> tuple[float, float]:
+    """Powers of ten about positive values."""
+    if not values.size:
+        return 0.1, 10.0
+    low, high = (np.log10(end) for end in (values.min(), values.max()))
+    return float(10.0 ** np.floor(low - 0.01)), float(10.0 ** np.ceil(high + 0.01))
+
+
 def _rounded(low: float, high: float) -> tuple[float, float]:
     """Widen a range by a margin, outwards to a multiple of a round number."""
     size = high - low
@@ -599,6 +823,9 @@ def pack(charts: Sequence[Chart]) -> dict[str, Any]:
         "vertical", "span", "limits" (None where there is none), its "lines" and its
         "trails".
 
+        "across" and "unit" label the horizontal axis; "origin" and "step" are those of
+        ``Chart``.
+
         A line has a "name" (that of its renderer in ``ChartFigure``), and "start" and
         "size" of its times; its values follow them.  A trail has "style", "held",
         "ahead", "steps" (Np), "start", where its (N, Np) values begin, and "present",
@@ -617,6 +844,10 @@ def pack(charts: Sequence[Chart]) -> dict[str, Any]:
             "limits": [side if np.isfinite(side) else None for side in chart.limits],
             "lines": _lines(box, chart),
             "trails": _trails(box, chart),
+            "across": chart.across,
+            "unit": chart.unit,
+            "origin": chart.origin,
+            "step": chart.step,
         }
         for chart in charts
     ]
@@ -643,6 +874,8 @@ def _lines(box: _Box, chart: Chart) -> list[dict[str, Any]]:
     """Every renderer's line; empty where the chart has no such curve."""
     curves: dict[str, Curve | None] = {f"style{i}": None for i in range(len(STYLES))}
     curves |= {f"style{curve.style}": curve for curve in chart.curves}
+    curves |= {f"flag{i}": None for i in range(len(STYLES))}
+    curves |= {f"flag{curve.style}": curve.flagged for curve in chart.curves}
     curves["ink"] = chart.references[0] if chart.references else None
     lines = []
     for name, curve in curves.items():
@@ -742,13 +975,17 @@ class ChartFigure:
     """
 
     def __init__(self, chart: Chart, times: Range1d | None = None) -> None:
-        self.figure = _empty_figure(chart.name, times or Range1d(*chart.span))
+        times = times or Range1d(*chart.span)
+        self.figure = _empty_figure(chart.name, times, chart.log)
         self.curves = [ColumnDataSource({"t": [], "y": []}) for _ in STYLES]
+        self.flags = [ColumnDataSource({"t": [], "y": []}) for _ in STYLES]
         self.references = ColumnDataSource({"t": [], "y": []})
         self._lines = [
             _add_line(self.figure, source, number)
             for number, source in enumerate(self.curves)
         ]
+        for number, source in enumerate(self.flags):
+            _add_flags(self.figure, source, number)
         ink = self.figure.line(
             "t", "y", source=self.references, color=INK, width=1.4, level="overlay"
         )
@@ -770,7 +1007,9 @@ class ChartFigure:
         """Draw another chart."""
         with_style = {curve.style: curve for curve in chart.curves}
         for style, source in enumerate(self.curves):
-            _fill(source, with_style.get(style))
+            curve = with_style.get(style)
+            _fill(source, curve)
+            _fill(self.flags[style], curve and curve.flagged)
         _fill(self.references, chart.references[0] if chart.references else None)
         for line, value in zip(self.limits, chart.limits, strict=True):
             line.update(location=value if np.isfinite(value) else None)
@@ -851,9 +1090,24 @@ def _add_points(plot: figure, source: ColumnDataSource, number: int) -> None:
     points.name = f"points{number}"
 
 
-def _empty_figure(name: str, times: Range1d | DataRange1d) -> figure:
+def _add_flags(plot: figure, source: ColumnDataSource, number: int) -> None:
+    flags = plot.scatter(
+        "t",
+        "y",
+        source=source,
+        size=9,
+        marker="x",
+        line_color=STYLES[number]["color"],
+        line_width=2,
+        level="overlay",
+    )
+    flags.name = f"flag{number}"
+
+
+def _empty_figure(name: str, times: Range1d | DataRange1d, log: bool = False) -> figure:
     plot = figure(
         name=name,
+        y_axis_type="log" if log else "linear",
         height=220,
         sizing_mode="stretch_both",
         x_range=times,

@@ -533,6 +533,10 @@ class StateDependentController(PredictiveController):
             initial=0.0
         )
         worst = point.cost + price * point.missed
+        # a decrease within rounding cannot be seen: the step is short, take it
+        slope = point.program.H @ point.z + point.program.f @ point.theta
+        if not point.missed and abs(slope @ step) <= 1e-11 * (1.0 + abs(worst)):
+            return self.problem.at(solution.decision, theta, scheme)
         for halved in range(12):
             trial = self.problem.at(point.z + 0.5**halved * step, theta, scheme)
             merit = trial.cost + price * trial.missed

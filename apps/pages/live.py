@@ -15,7 +15,7 @@ import jinja2
 import panel as pn
 from bokeh.models import Range1d
 
-from apps.player import Controls, Player, moving
+from apps.player import INSIDE, Controls, Player, moving, stepping
 from apps.session import Choices, plain
 from nmss_lab.measures import table
 from nmss_lab.plots import Chart, ChartFigure, busiest_sample, time_unit
@@ -27,6 +27,7 @@ PAGES = (
     ("receding_horizon", "Receding horizon"),
     ("governor", "Reference governor"),
     ("identify", "Identify"),
+    ("state_dependent", "State-dependent"),
 )
 
 PARTS = "lead", "alert", "player", "measures", "python", "notes", "controls"
@@ -57,6 +58,8 @@ class Subject:
     choices : type of Choices
     charts : function of (runs, output, input)
     look : mapping from a case to one sentence: what to look at
+    inside : function of choices, optional
+        Charts of one sample from within, and words for each of their steps.
     """
 
     path: str
@@ -64,6 +67,7 @@ class Subject:
     choices: type[Choices]
     charts: Callable[[Mapping[str, Run], int, int], list[Chart]]
     look: Mapping[str, str]
+    inside: Callable[[Any], tuple[list[Chart], list[Any]]] | None = None
 
 
 class LivePage:
@@ -83,6 +87,8 @@ class LivePage:
         self.player = Player(
             run=moving(charts, self._named(), start, True), sizing_mode="stretch_width"
         )
+        self.within: dict[str, ChartFigure] = {}
+        self.inside = self._first_inside()
         self.controls = Controls(
             form=self._form(), state=self._state(0), sizing_mode="stretch_width"
         )
@@ -98,6 +104,24 @@ class LivePage:
             self.complaint = self.complaint or f"{ADDRESS}{error}"
             self.choices.take_case(self.choices.case)
             return self._compute()
+
+    def _first_inside(self) -> Player | None:
+        """Figures and player of one sample from within, where the page has them."""
+        if self.subject.inside is None:
+            return None
+        charts, words = self.subject.inside(self.choices)
+        over = Range1d(*charts[0].span), Range1d(*charts[-1].span)
+        self.within = {
+            chart.name: ChartFigure(chart, over[int(chart.origin is not None)])
+            for chart in charts
+        }
+        steps = stepping(charts, words)
+        return Player(run=steps, place=INSIDE, sizing_mode="stretch_width")
+
+    def _look_inside(self) -> None:
+        """Show the chosen sample from within."""
+        if self.inside is not None and self.subject.inside is not None:
+            self.inside.run = stepping(*self.subject.inside(self.choices))
 
     def _compute(self) -> tuple[dict[str, Run], list[Chart]]:
         runs = self.choices.runs()
@@ -115,6 +139,7 @@ class LivePage:
         try:
             self._accept(sent)
             self.runs, charts = self._compute()
+            self._look_inside()
             self.complaint = ""
         except ValueError as error:
             self.complaint, charts = f"{error}\n{KEPT}", []
@@ -166,6 +191,7 @@ class LivePage:
         page = page_template(
             self.subject.path, self.subject.heading, list(self.figures)
         )
+        page.add_variable("within", list(self.within))
         for name in (
             "lead",
             "alert",
@@ -176,7 +202,9 @@ class LivePage:
             "controls",
         ):
             page.add_panel(name, getattr(self, name))
-        for name, drawn in self.figures.items():
+        if self.inside is not None:
+            page.add_panel("inside", self.inside)
+        for name, drawn in {**self.figures, **self.within}.items():
             pane = pn.pane.Bokeh(drawn.figure, sizing_mode="stretch_both")
             page.add_panel(f"chart_{name}", pane)
         return page
