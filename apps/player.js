@@ -57,12 +57,13 @@ export function render({ model, el }) {
     request()
   }
   const step = (by) => { play(false); go(Math.floor(time + 1e-9) + by) }
+  const noun = place.noun.toLowerCase()
   const hint = (key) => place.keys ? ` (${key})` : ""
   const toggle = button("play", "Play" + hint("space"), () => play(!playing))
   toggle.classList.add("main")
   const scrub = element("input", {
     type: "range", min: 0, max: last(), step: 1, "aria-label": place.noun,
-    name: place.noun.toLowerCase(),
+    name: noun,
   })
   scrub.addEventListener("input", () => { play(false); go(Number(scrub.value)) })
   const clock = element("output", { class: "clock", "aria-live": "off" })
@@ -95,9 +96,9 @@ export function render({ model, el }) {
     element("div", { class: "playbar", role: "group", "aria-label": place.label },
       element("div", { class: "buttons" },
         button("first", "To the start" + hint("Home"), () => { play(false); go(0) }),
-        button("back", "One step back" + hint("left arrow"), () => step(-1)),
+        button("back", `One ${noun} back` + hint("left arrow"), () => step(-1)),
         toggle,
-        button("forward", "One step on" + hint("right arrow"), () => step(1)),
+        button("forward", `One ${noun} on` + hint("right arrow"), () => step(1)),
         button("last", "To the end" + hint("End"), () => { play(false); go(last()) })),
       scrub, clock,
       element("div", { class: "options" }, speed, loopLabel, fanLabel, ...looking)))
@@ -224,7 +225,6 @@ export function render({ model, el }) {
 
   const describe = (k) => {
     const time_ = run.data[k]
-    const noun = place.noun.toLowerCase()
     clock.textContent = run.unit === "-" ? `${noun} ${k + 1} of ${run.samples}`
       : `${noun} ${k} \u00b7 ${Number(time_.toPrecision(4))} ${run.unit}`
     scrub.value = k

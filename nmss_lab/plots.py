@@ -360,7 +360,7 @@ def inside_charts(
     t = run.t[k] / seconds + step * np.arange(len(best.y) + 1)
     change = Chart(
         "change",
-        "Way from the plan to the program\u2019s optimum",
+        "Change of the plan, pass by pass",
         f"{u}{in_u}",
         tuple(
             Curve(name, numbers[: len(found)], _changes(found), style=style)

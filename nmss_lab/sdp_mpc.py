@@ -539,7 +539,7 @@ class StateDependentController(PredictiveController):
             return self.problem.at(solution.decision, theta, scheme)
         for halved in range(12):
             trial = self.problem.at(point.z + 0.5**halved * step, theta, scheme)
-            merit = trial.cost + price * trial.missed
+            merit = trial.cost + (price * trial.missed if price else 0.0)
             if merit <= worst + 1e-12 * (1.0 + abs(worst)):
                 return trial
         return trial

@@ -5,8 +5,9 @@ import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -186,3 +187,55 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     running = Server(tmp_path_factory.mktemp("server") / "stderr.log")
     yield running
     running.stop()
+
+
+# --- A live page in the browser ----------------------------------------------------
+
+Open = Callable[..., Page]
+
+
+@pytest.fixture
+def visit(server: Server, browser: Browser) -> Iterator[Open]:
+    """Yield a function that opens a page; at the end nothing may have complained."""
+    said: list[str] = []
+    contexts = []
+
+    def open_page(path: str, width: int = 1440, height: int = 900, **more: Any) -> Page:
+        context = browser.new_context(
+            viewport={"width": width, "height": height}, **more
+        )
+        contexts.append(context)
+        page = context.new_page()
+        page.on("pageerror", lambda error: said.append(str(error)))
+        page.on(
+            "console",
+            lambda m: said.append(m.text) if m.type in ("error", "warning") else None,
+        )
+        page.goto(server.url + path)
+        page.wait_for_function("window.nmssPlayer?.frames > 0", timeout=60_000)
+        return page
+
+    yield open_page
+    for context in contexts:
+        context.close()
+    assert said == []
+
+
+def settled(page: Page) -> None:
+    """Wait until the form has no message under way."""
+    page.wait_for_function("window.nmssForm.idle()", timeout=60_000)
+
+
+def slide(page: Page, name: str, end: str) -> None:
+    """Put a slider to one of its ends, as a hand would: by input events."""
+    page.locator(f"input[name={name}]").evaluate(
+        "(input, end) => { input.value = input[end];"
+        " input.dispatchEvent(new Event('input', { bubbles: true })) }",
+        end,
+    )
+    settled(page)
+
+
+def picture(page: Page) -> str:
+    """Return the pixels of the first chart."""
+    return str(page.locator(".chart").first.screenshot())

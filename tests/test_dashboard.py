@@ -5,14 +5,14 @@ from __future__ import annotations
 import contextlib
 import io
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 import param
 import pytest
-from conftest import REPLAY, Server
-from playwright.sync_api import Browser, Page, expect
+from conftest import REPLAY, Open, Server, picture, settled, slide
+from playwright.sync_api import expect
 
 from apps.pages import governor, receding_horizon
 from apps.pages.live import LivePage, Subject
@@ -280,55 +280,6 @@ def test_draw_for_notebooks(charts: list[Chart]) -> None:
 
 
 # --- In the browser ------------------------------------------------------------------
-
-Open = Callable[..., Page]
-
-
-@pytest.fixture
-def visit(server: Server, browser: Browser) -> Iterator[Open]:
-    """Yield a function that opens a page; at the end nothing may have complained."""
-    said: list[str] = []
-    contexts = []
-
-    def open_page(path: str, width: int = 1440, height: int = 900, **more: Any) -> Page:
-        context = browser.new_context(
-            viewport={"width": width, "height": height}, **more
-        )
-        contexts.append(context)
-        page = context.new_page()
-        page.on("pageerror", lambda error: said.append(str(error)))
-        page.on(
-            "console",
-            lambda m: said.append(m.text) if m.type in ("error", "warning") else None,
-        )
-        page.goto(server.url + path)
-        page.wait_for_function("window.nmssPlayer?.frames > 0", timeout=60_000)
-        return page
-
-    yield open_page
-    for context in contexts:
-        context.close()
-    assert said == []
-
-
-def settled(page: Page) -> None:
-    """Wait until the form has no message under way."""
-    page.wait_for_function("window.nmssForm.idle()", timeout=60_000)
-
-
-def slide(page: Page, name: str, end: str) -> None:
-    """Put a slider to one of its ends, as a hand would: by input events."""
-    page.locator(f"input[name={name}]").evaluate(
-        "(input, end) => { input.value = input[end];"
-        " input.dispatchEvent(new Event('input', { bubbles: true })) }",
-        end,
-    )
-    settled(page)
-
-
-def picture(page: Page) -> str:
-    """Return the pixels of the first chart."""
-    return str(page.locator(".chart").first.screenshot())
 
 
 @pytest.mark.parametrize(
