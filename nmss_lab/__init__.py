@@ -12,6 +12,7 @@ from nmss_lab.analysis import (
 from nmss_lab.cases import CASES, Case, case
 from nmss_lab.continuous import ContinuousPlant, TransferFunction, difference_model
 from nmss_lab.controller import Controller, Limits, Memory, Move, Status
+from nmss_lab.convergence import Examination, examine
 from nmss_lab.design import Design
 from nmss_lab.governor import governor
 from nmss_lab.models import DifferenceModel, LinearPlant, Plant
@@ -29,7 +30,17 @@ from nmss_lab.pip import lq_gain, pip, pole_gain
 from nmss_lab.predict import Horizon
 from nmss_lab.predictive import PredictiveController
 from nmss_lab.records import Record
-from nmss_lab.simulate import Run, Scenario, closed_loop, closed_loops, samples
+from nmss_lab.sdp import sdp_governor, sdp_pip
+from nmss_lab.sdp_mpc import Settling, sdp_increments, sdp_integral_of_error
+from nmss_lab.simulate import (
+    Run,
+    Scenario,
+    closed_loop,
+    closed_loops,
+    many_loops,
+    samples,
+)
+from nmss_lab.state_dependent import StateDependentModel
 
 __all__ = [
     "CASES",
@@ -39,6 +50,7 @@ __all__ = [
     "Controller",
     "Design",
     "DifferenceModel",
+    "Examination",
     "Horizon",
     "Limits",
     "LinearLoop",
@@ -51,6 +63,8 @@ __all__ = [
     "Review",
     "Run",
     "Scenario",
+    "Settling",
+    "StateDependentModel",
     "Status",
     "TransferFunction",
     "__version__",
@@ -61,16 +75,22 @@ __all__ = [
     "difference_model",
     "disturbance_augmented",
     "disturbance_direct",
+    "examine",
     "forward_path",
     "governor",
     "integral_of_error",
     "linear_loop",
     "lq_gain",
+    "many_loops",
     "minimal",
     "pip",
     "pole_gain",
     "review",
     "samples",
+    "sdp_governor",
+    "sdp_increments",
+    "sdp_integral_of_error",
+    "sdp_pip",
     "state_weight",
     "wang_young",
 ]

@@ -15,6 +15,7 @@ from nmss_lab.controller import Status
 from nmss_lab.models import minimal_realisation
 from nmss_lab.nmss import _deadbeat, differenced_form
 from nmss_lab.records import Record
+from nmss_lab.sdp_mpc import SCHEMES
 from nmss_lab.simulate import closed_loop
 
 DESIGNS = [
@@ -29,12 +30,18 @@ def test_a_case_is_complete(name: str) -> None:
     case = cases.case(name)
     assert case.name == name
     assert case.title
-    assert case.section
+    assert case.section or name in cases.VARYING_CASES
     assert case.source
     assert len(case.notes) >= 3
     assert all(note.endswith(".") for note in case.notes)
     structures = {design.structure for design in case.designs.values()}
-    assert {"integral_of_error", "wang_young", "forward_path", "minimal"} <= structures
+    linear = {"integral_of_error", "wang_young", "forward_path", "minimal"}
+    if name in cases.VARYING_CASES:
+        settlings = [design.options.get("settling") for design in case.designs.values()]
+        assert set(SCHEMES) == {each.scheme for each in settlings if each is not None}
+        assert {"frozen", "iterated", "gauss_newton", "newton"} <= set(case.designs)
+    else:
+        assert linear <= structures
     for design in case.designs.values():
         assert np.isclose(design.model.dt, case.plant.dt)
     for low, high in case.bands.values():
@@ -53,7 +60,10 @@ def test_every_design_runs(name: str, design: str) -> None:
         low, high = controller.limits.of(kind, controller.model.n_u)
         assert (signal >= low - 1e-9).all()  # rounding of sums of changes
         assert (signal <= high + 1e-9).all()
-    assert (run.status <= Status.CLIPPED).all(), run.sentences
+    varies = list(range(Status.AMBIGUOUS, Status.GUARDED + 1))
+    allowed = varies if name in cases.VARYING_CASES else []
+    fine = (run.status <= Status.CLIPPED) | np.isin(run.status, allowed)
+    assert fine.all(), run.sentences
 
 
 @pytest.mark.parametrize(("name", "design"), LINEAR)

@@ -16,6 +16,7 @@ from nmss_lab.reproduce import (
     chapter_5,
     chapter_6,
     chapter_7,
+    chapter_8,
 )
 from nmss_lab.reproduce.rows import ERRATA, Claim, table
 
@@ -28,6 +29,7 @@ CHAPTERS: dict[int, tuple[Callable[[], Iterator[Claim]], ...]] = {
     5: chapter_5.TOPICS,
     6: chapter_6.TOPICS,
     7: chapter_7.TOPICS,
+    8: chapter_8.TOPICS,
 }
 """Topics of each chapter."""
 

@@ -44,6 +44,24 @@ ERRATA: dict[str, str] = {
     "E7.1": "the literal (7.4) counts the present change of v twice",
     "E7.2": "the unit of u1 in 7.4.2 is 100 m3/h: Table 7.4 reads 10 to 25, rate 3.5",
     "E7.3": "G_Delta,1 of Table 7.1 has lr rows",
+    "E8.1": "(8.2a) takes d r_{k+1}, as (3.1a) and (8.7) do",
+    "E8.2": "Z^{i,j+1} in 8.3.2 is Z^{i,j} times the inverse of A_{k+j}, which a form "
+    "with past inputs does not have: predictions are rolled forward",
+    "E8.3": "W in 8.3.2 sums Z^{i,Nc+l} b, and goes on with A_{k+i}",
+    "E8.4": "each column of Phi_k in (8.5b) carries the b of its own step",
+    "E8.5": "in 8.4.1 the reference enters by single terms A^{i-1-l} d, and row Nc + 1 "
+    "of Phi_3 ends with A b + b",
+    "E8.6": "W-tilde in 8.4.2 sums Z^{i,l} b_{k+l-1}",
+    "E8.7": "8.5.1 starts with z = 1, which holds u = 0.3",
+    "E8.8": "8.5.2 is at rest with u = sqrt(0.3) and, with an integral, the z that "
+    "holds it",
+    "E8.9": "with a gain that varies (3.13a) must take the change of k_k x_k, or of "
+    "y_{k-1} u_k in 8.5.1, not k_k times the change of x_k",
+    "E8.10": "the terminal condition of Proposition 8.4.1 is rest at the reference: "
+    "outputs at r and the inputs that parameters depend on at the value that holds "
+    "them",
+    "E8.11": "optimality for the plant needs the derivative of the parameters with "
+    "respect to the plan",
 }
 """Corrections that rows refer to."""
 
