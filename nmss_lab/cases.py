@@ -1199,8 +1199,8 @@ def conical_tank() -> Case:
             "the change of the level is inflow minus 60 sqrt(level).",
             "The area of the surface grows with the square of the level, so at 20 cm "
             "the tank is nine times as fast as at 60 cm.",
-            "Below 12 cm the steps are too long for the outflow; the limit on the level "
-            "is soft and keeps it above.",
+            "Below 12 cm the steps are too long for the outflow; a soft limit keeps "
+            "the level above.",
         ),
     )
 

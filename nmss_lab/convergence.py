@@ -190,9 +190,10 @@ def examine(
 def trail_mismatch(run: Run) -> Array:
     """Root mean square difference of consecutive predictions of y, (N,)."""
     trail = run.trail("y")
+    if trail.shape[1] == 1:  # nothing overlaps
+        return np.full(len(trail), np.nan)
     apart = trail[1:, :-1] - trail[:-1, 1:]
-    rms = np.sqrt((apart**2).mean(axis=(1, 2))) if trail.shape[1] > 1 else apart[:, 0]
-    return np.concatenate([[np.nan], rms.reshape(len(trail) - 1)])
+    return np.concatenate([[np.nan], np.sqrt((apart**2).mean(axis=(1, 2)))])
 
 
 def iterates(run: Run, k: int, settling: Settling | None = None) -> list[Iterate]:
@@ -214,7 +215,7 @@ def iterates(run: Run, k: int, settling: Settling | None = None) -> list[Iterate
     settling = settling or controller.settling
     plan = sample.last_plan if settling.warm_start else None
     start = controller.start_of(sample.theta, plan, settling)
-    trace, found = Trace(settling), []
+    trace, found = Trace(settling, controller.problem), []
     runaway = controller.runaway(sample.theta)
     for each in controller.passes(sample.theta, start, settling):
         trace.take(each)
@@ -277,8 +278,7 @@ def best_plan(run: Run, k: int, starts: int = 8, seed: int = 0) -> Best:
     ]
     points = [sample.at(z) for z in plans]
     points += [sample.at(sample.decision)] if sample.has_plan else []
-    kept = [p for p in points if p.missed <= 1e-6] or points
-    best = min(kept, key=lambda point: point.cost)
+    best = min(points, key=controller.problem.standing)
     near = 1e-6 * (1.0 + abs(best.cost))
     found = sum(point.cost <= best.cost + near for point in points[: len(plans)])
     return Best(best.z, best.U, best.y, best.cost, found, len(plans))

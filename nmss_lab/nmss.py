@@ -389,6 +389,11 @@ def _kalman(A: Array, B: Array, C: Array, q: float, r: float) -> Array:
 
 def _past(model: DifferenceModel) -> tuple[dict[str, Array], tuple[str, ...]]:
     """Build A and B of (4.3): past outputs and inputs move down by one sample."""
+    if not isinstance(model, DifferenceModel):
+        raise ValueError(
+            f"model is a {type(model).__name__}, expected a DifferenceModel; for a "
+            "state-dependent one take the functions that begin with sdp_"
+        )
     p, q, na, nb = model.n_y, model.n_u, model.na, model.nb
     n_past_y, n_past_u = na * p, (nb - 1) * q
     A = np.zeros((n_past_y + n_past_u,) * 2)

@@ -130,6 +130,20 @@ def lq_gain(model: DifferenceModel, Q: Any, R: Any) -> Array:
     """
     form = integral_of_error_form(model)
     Q, R = weight("Q", Q, 1, form.n_x), weight("R", R, 1, model.n_u)
+    check_signs(Q, R)
+    P = lq_cost(form.A, form.B, Q, R)
+    K: Array = np.linalg.solve(R + form.B.T @ P @ form.B, form.B.T @ P @ form.A)
+    return K
+
+
+def check_signs(Q: Array, R: Array) -> None:
+    """Check that Q has no negative eigenvalue and R only positive ones.
+
+    Raises
+    ------
+    ValueError
+        Naming the weight, with its smallest eigenvalue.
+    """
     for name, matrix, least in (("Q", Q, -1e-12), ("R", R, 1e-12)):
         smallest = float(np.linalg.eigvalsh(matrix)[0])
         if smallest < least * max(1.0, np.abs(matrix).max()):
@@ -137,9 +151,6 @@ def lq_gain(model: DifferenceModel, Q: Any, R: Any) -> Array:
             raise ValueError(
                 f"{name} has the eigenvalue {smallest:.4g}; all of them must {wanted}"
             )
-    P = lq_cost(form.A, form.B, Q, R)
-    K: Array = np.linalg.solve(R + form.B.T @ P @ form.B, form.B.T @ P @ form.A)
-    return K
 
 
 def lq_cost(A: Array, B: Array, Q: Array, R: Array) -> Array:
@@ -189,15 +200,8 @@ def pole_gain(model: DifferenceModel, poles: Sequence[complex]) -> Array:
     array([[ 3.16, -3.05,  6.1 , -0.64]])
     """
     form = integral_of_error_form(model)
-    wanted = np.asarray(poles, dtype=complex)
-    if wanted.shape != (form.n_x,):
-        raise ValueError(
-            f"poles has {wanted.size} entries, expected {form.n_x}: n_y (na + 1) + "
-            "n_u (nb - 1)"
-        )
+    wanted = check_poles(poles, form.n_x)
     polynomial = np.poly(wanted)
-    if np.abs(polynomial.imag).max() > 1e-9:
-        raise ValueError("poles: complex ones must come in conjugate pairs")
     if form.controllable_rank() < form.n_x:
         raise ValueError(
             f"the input reaches {form.controllable_rank()} of {form.n_x} states: the "
@@ -212,6 +216,27 @@ def pole_gain(model: DifferenceModel, poles: Sequence[complex]) -> Array:
             f"miss by {error:.2g}; use fewer repeated poles, or lq_gain"
         )
     return K
+
+
+def check_poles(poles: Sequence[complex], n_x: int) -> Array:
+    """Poles as an array (n_x,), complex.
+
+    Raises
+    ------
+    ValueError
+        If their number is not n_x or pairs are incomplete.
+    """
+    wanted = np.asarray(poles, dtype=complex)
+    if wanted.shape != (n_x,):
+        raise ValueError(
+            f"poles has {wanted.size} entries, expected {n_x}: n_y (na + 1) + "
+            "n_u (nb - 1)"
+        )
+    if not np.isfinite(wanted).all() or np.abs(np.poly(wanted).imag).max() > 1e-9:
+        raise ValueError(
+            "poles must be finite, and complex ones come in conjugate pairs"
+        )
+    return wanted
 
 
 def _place(form: Form, wanted: Array, polynomial: Array) -> Array:

@@ -240,6 +240,16 @@ class PredictiveController(Controller):
         step = np.minimum(np.arange(self.horizon.Np) + shift, self.horizon.Np - 1)
         return np.take_along_axis(plan, step[..., None], axis=-2)
 
+    def _missed(self, memory: Memory, u: Array, move: Move) -> Array:
+        """As for any controller, by the law of the plan that was made now."""
+        made_now = np.asarray(move.shift == 0)[..., None]
+        free = np.where(
+            made_now,
+            move.known @ self.free_gain.T,
+            u - super()._missed(memory, u, move),
+        )
+        return np.where(self._overruled(u, free, move), u - free, 0.0)
+
     def _overruled(self, u: Array, free: Array, move: Move) -> Array:
         """As for any controller, and where a level limit holds the input, (..., 1)."""
         other = super()._overruled(u, free, move)

@@ -22,10 +22,10 @@ from nmss_lab.nmss import (
     incremental_pip_form,
     integral_of_error_form,
 )
-from nmss_lab.pip import lq_gain, pole_gain
+from nmss_lab.pip import check_poles, check_signs, lq_gain, pole_gain
 from nmss_lab.predict import Horizon, known_part
 from nmss_lab.predictive import Knowledge, PredictiveController
-from nmss_lab.qp import QuadraticProgram, Row, find_backend
+from nmss_lab.qp import QuadraticProgram, Row, find_backend, weight
 from nmss_lab.state_dependent import StateDependentModel
 
 NOT_LINEAR = (
@@ -227,28 +227,50 @@ def _gain_of(
     R: Any,
     largest: float,
 ) -> FrozenGain:
-    """Check which design is meant.
+    """Check which design is meant, and that it is one.
 
     Raises
     ------
     ValueError
-        Unless either poles or both weights are given.
+        Unless either poles or both weights are given, or if they can be no design for
+        any plant.
     """
+    check_equation(model)
     if not largest > 0:
         raise ValueError(f"largest_gain = {largest} must be positive")
     by_weights = Q is not None and R is not None
     if (poles is not None) == by_weights or (Q is None) != (R is None):
         raise ValueError("give either poles, or both weights Q and R")
-    if by_weights:
-        return FrozenGain(model, _Weighed(Q, R), largest)
     size = (model.na + 1) * model.n_y + (model.nb - 1) * model.n_u
-    wanted = np.ravel(np.asarray(poles, dtype=complex))
-    if wanted.size != size:
-        raise ValueError(
-            f"poles has {wanted.size} entries, expected {size}: n_y (na + 1) + "
-            "n_u (nb - 1)"
-        )
+    if by_weights:
+        Q, R = weight("Q", Q, 1, size), weight("R", R, 1, model.n_u)
+        check_signs(Q, R)
+        return FrozenGain(model, _Weighed(Q, R), largest)
+    wanted = check_poles(poles or (), size)
     return FrozenGain(model, _Placed(tuple(wanted)), largest)
+
+
+def check_equation(model: Any) -> None:
+    """Check that a model is a state-dependent one.
+
+    Raises
+    ------
+    ValueError
+        If it is something else.
+    """
+    if not isinstance(model, StateDependentModel):
+        raise ValueError(
+            f"model is a {type(model).__name__}, expected a StateDependentModel; for a "
+            "DifferenceModel take the function without sdp_"
+        )
+
+
+def _checked(limits: Limits | None, model: StateDependentModel) -> Limits:
+    """Limits that fit the model."""
+    limits = limits or Limits()
+    for name, size in (("u", model.n_u), ("du", model.n_u), ("y", model.n_y)):
+        limits.of(name, size)  # type: ignore[arg-type]
+    return limits
 
 
 @dataclass(frozen=True)
@@ -310,9 +332,10 @@ def sdp_pip(
     if law not in ("positional", "incremental"):
         raise ValueError(f'law = "{law}": expected "positional" or "incremental"')
     gain = _gain_of(model, poles, Q, R, largest_gain)
+    limits = _checked(limits, model)
     make = integral_of_error_form if law == "positional" else incremental_pip_form
     return StateDependentFeedback(
-        model.wide, make(model.wide), limits or Limits(), gain, anti_windup
+        model.wide, make(model.wide), limits, gain, anti_windup
     )
 
 
@@ -448,8 +471,14 @@ def sdp_governor(
     if reference not in ("held", "preview"):
         raise ValueError(f'reference = "{reference}": expected "held" or "preview"')
     find_backend(backend)
-    limits, horizon = limits or Limits(), Horizon(Np, Np)
     gain = _gain_of(model, poles, Q, R, largest_gain)
+    radius = max((abs(pole) for pole in np.ravel(poles or ())), default=0.0)
+    if radius >= 1.0:
+        raise ValueError(
+            f"poles: the largest has modulus {radius:.4f}; a governor needs a loop "
+            "that is stable, all of them less than 1"
+        )
+    limits, horizon = _checked(limits, model), Horizon(Np, Np)
     form = integral_of_error_form(model.wide, governed=True)
     p, q = model.n_y, model.n_u
     sizes = {"u": q, "du": q, "y": p, "w": p, "beta": p}

@@ -32,6 +32,7 @@ from nmss_lab.controller import Limits, Memory, Move, Status
 from nmss_lab.models import Array
 from nmss_lab.mpc import Reading, Setup, Terminal
 from nmss_lab.nmss import Form, Layout, integral_of_error_form, past_form
+from nmss_lab.pip import check_signs
 from nmss_lab.predict import Affine, Horizon, blocks, known_part, predict, stack
 from nmss_lab.predictive import (
     Knowledge,
@@ -50,7 +51,14 @@ from nmss_lab.qp import (
     sum_of_squares,
     weight,
 )
-from nmss_lab.sdp import NOT_LINEAR, expected, follow, missed_by, thesis_state
+from nmss_lab.sdp import (
+    NOT_LINEAR,
+    check_equation,
+    expected,
+    follow,
+    missed_by,
+    thesis_state,
+)
 from nmss_lab.state_dependent import StateDependentModel
 
 LOG = logging.getLogger(__name__)
@@ -103,12 +111,21 @@ class Settling:
             raise ValueError(
                 f'scheme = "{self.scheme}": expected one of {", ".join(SCHEMES)}'
             )
+        for name in ("damping", "tolerance", "seconds"):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(
+                value, int | float | np.number
+            ):
+                raise ValueError(f"{name} = {value!r}: expected a number")
         if not 0.0 <= self.damping < 1.0:
             raise ValueError(f"damping = {self.damping}: expected 0 <= damping < 1")
         if not self.tolerance > 0.0:
             raise ValueError(f"tolerance = {self.tolerance} must be positive")
-        if isinstance(self.passes, bool) or not self.passes >= 1:
-            raise ValueError(f"passes = {self.passes}: expected at least 1")
+        whole = isinstance(self.passes, int | np.integer)
+        if isinstance(self.passes, bool) or not whole or not self.passes >= 1:
+            raise ValueError(
+                f"passes = {self.passes!r}: expected a whole number, at least 1"
+            )
         if not self.seconds > 0.0:
             raise ValueError(f"seconds = {self.seconds} must be positive")
 
@@ -130,8 +147,9 @@ class Point:
         Outputs of the model itself under U.
     cost : float
         J of the plan with those outputs.
-    missed : float
-        Sum of what the outputs' limits are broken by.
+    broken : array (rows on outputs,)
+        What the program's rows on outputs, a terminal condition included, are broken
+        by.
     frozen : bool
         Whether the coefficients are those of the present sample.
     """
@@ -143,7 +161,7 @@ class Point:
     U: Array
     y: Array
     cost: float
-    missed: float
+    broken: Array
     frozen: bool = False
 
 
@@ -241,6 +259,7 @@ class Problem:
             upper,
             tuple(label for label, ok in zip(labels, kept, strict=True) if ok),
         )
+        self.ranks = output_ranks(self.template, self.limits, self.equation.n_y)
 
     def _offset_signals(self) -> list[Affine]:
         """List what enters each state: the reference, and the equation's c."""
@@ -286,8 +305,18 @@ class Problem:
         U = self.U.value(z, theta).reshape(self.horizon.Np, -1)
         return U, self.equation.roll_out(y, u, U, load)
 
-    def at(self, z: Array, theta: Array, scheme: Scheme) -> Point:
-        """Point of a plan: predict, read the coefficients, make the program."""
+    def at(
+        self,
+        z: Array,
+        theta: Array,
+        scheme: Scheme,
+        multipliers: Array | None = None,
+    ) -> Point:
+        """Point of a plan: predict, read the coefficients, make the program.
+
+        ``multipliers`` (rows,) of the last program let the scheme "newton" see how the
+        rows on outputs bend as well.
+        """
         y, u, load = self.past(theta)
         U, outputs = self.rolled(z, theta)
         steps, theta = self.horizon.Np, theta.copy()
@@ -313,15 +342,17 @@ class Problem:
         if not size < LARGEST:
             return self._ran_away(z, theta, U, outputs)
         if scheme == "newton":
-            program = self._with_curvature(program, z, theta, X, seen)
+            if multipliers is None:
+                multipliers = np.zeros(len(self.template.labels))
+            price = self._prices(program, z, theta, multipliers)
+            program = self._with_curvature(program, z, price, X, seen)
         cost = (
             float(program.cost(z, theta))
             if scheme != "newton"
             else self._cost(z, theta, X, Y)
         )
-        return Point(
-            z, theta, program, Y, U, outputs, cost, self.missed(outputs, theta), frozen
-        )
+        broken = self._broken(program, z, theta)
+        return Point(z, theta, program, Y, U, outputs, cost, broken, frozen)
 
     def _along(
         self, scheme: Scheme, seen: tuple[Array, Array], outputs: Array, load: Array
@@ -339,7 +370,8 @@ class Problem:
         n_z, n = self.setup.n_z, len(outputs.ravel())
         nothing = Affine(np.zeros((n, n_z)), np.zeros((n, self.known.size)))
         program = self._program_of(np.eye(n_z + self.known.size), nothing)
-        return Point(z, theta, program, nothing, U, outputs, np.inf, np.inf)
+        broken = np.full(len(self._reads), np.inf)
+        return Point(z, theta, program, nothing, U, outputs, np.inf, broken)
 
     def _outputs_of(self, X: Affine) -> Affine:
         n_x, p = self.setup.form.n_x, self.equation.n_y
@@ -370,20 +402,15 @@ class Problem:
         self,
         program: QuadraticProgram,
         z: Array,
-        theta: Array,
+        price: Array,
         X: Affine,
         seen: tuple[Array, Array],
     ) -> QuadraticProgram:
-        """Program whose Hessian is that of the true cost, made positive definite.
+        """Program whose Hessian is that of the true problem, made positive definite.
 
-        An offset c_i of the equation stands in the known vector, so the program itself
-        says what J gains by it; that price times the equation's curvature, along the
-        windows that a plan moves, is what the Jacobian leaves out.
+        The price of an offset of the equation times the equation's curvature, along
+        the windows that a plan moves, is what the Jacobian leaves out.
         """
-        c = self.known["c"]
-        price = (program.f[:, c].T @ z + program.constant[c] @ theta).reshape(
-            self.horizon.Np, -1
-        )
         bent = np.einsum("ij,ijab->iab", price, self.equation.curvature(*seen))
         W = self._window_gains(X)
         H = program.H + np.einsum("iaz,iab,ibw->zw", W, bent, W)
@@ -393,6 +420,18 @@ class Problem:
         f = program.f.copy()
         f[:, self.known["one"].start] += (program.H - H) @ z
         return dataclasses.replace(program, H=H, f=f)
+
+    def _prices(
+        self, program: QuadraticProgram, z: Array, theta: Array, multipliers: Array
+    ) -> Array:
+        """Price an offset of the equation at each step, (Np, n_y).
+
+        The offset c stands in the known vector, so the program itself tells.
+        """
+        c = self.known["c"]
+        price = program.f[:, c].T @ z + program.constant[c] @ theta
+        price = price + program.offset[:, c].T @ multipliers
+        return price.reshape(self.horizon.Np, -1)
 
     def _window_gains(self, X: Affine) -> Array:
         """How a decision moves the past values of each step, (Np, m, n_z)."""
@@ -410,11 +449,36 @@ class Problem:
         value = weighed.value(z, theta)
         return float(value @ self.weight_x @ value + z @ self.weight_z @ z)
 
-    def missed(self, outputs: Array, theta: Array) -> float:
-        """Sum of what outputs (Np, n_y) break their limits by."""
-        low, high = self.limits.of("y", self.equation.n_y)
-        beyond = np.maximum(np.maximum(low - outputs, outputs - high), 0.0)
-        return float(beyond.sum())
+    def _broken(self, program: QuadraticProgram, z: Array, theta: Array) -> Array:
+        """By how much each row on outputs is broken."""
+        rows = self.on_outputs
+        value = program.M[rows] @ z + program.offset[rows] @ theta
+        low, high = self.template.lower[rows], self.template.upper[rows]
+        return np.maximum(np.maximum(low - value, value - high), 0.0)
+
+    def standing(self, point: Point) -> tuple[float, ...]:
+        """Rank a plan among others: what it breaks, by importance, then what it costs.
+
+        Soft limits are part of the cost.
+        """
+        if not np.isfinite(point.cost):
+            return (np.inf,)
+        if self.limits.outputs == "soft":
+            return (
+                point.cost
+                + self.limits.soft_weight * float(point.broken @ point.broken),
+            )
+        ranks = self.ranks[self.on_outputs]
+        sums = [point.broken[ranks == rank].sum() for rank in np.unique(ranks)]
+        return (*(round(float(each), 9) for each in sums), point.cost)
+
+    def merit(self, point: Point, price: float) -> float:
+        """Give what a step should lower: the cost and a price of broken rows."""
+        if not np.isfinite(point.cost):
+            return np.inf
+        if self.limits.outputs == "soft":
+            return self.standing(point)[0]
+        return point.cost + price * float(point.broken.sum())
 
     def from_inputs(self, U: Array, theta: Array) -> Array:
         """Decision whose inputs come closest to U (Np, n_u), step by step."""
@@ -490,9 +554,10 @@ class StateDependentController(PredictiveController):
         while True:
             solution, status = self._optimum(point, before, guess)
             change = float(np.abs(solution.decision - point.z).max())
-            yield Pass(point, solution, status, change)
+            each = Pass(point, solution, status, change)
+            yield each
             guess = solution.decision, solution.multipliers
-            point = self._following(point, solution, theta, settling)
+            point = self._following(each, theta, settling)
 
     def _optimum(
         self, point: Point, before: Array, guess: tuple[Array, Array] | None
@@ -504,9 +569,7 @@ class StateDependentController(PredictiveController):
             told = "the predictions run away before any program can be made"
             return Solution(*nothing, QPStatus.FAILED, message=told), Status.HELD
         try:
-            z = -scipy.linalg.cho_solve(
-                scipy.linalg.cho_factor(program.H), program.f @ theta
-            )
+            z = _free_optimum(program, theta)
         except (np.linalg.LinAlgError, ValueError) as error:
             return Solution(*nothing, QPStatus.FAILED, message=str(error)), Status.HELD
         if (program.room(z, theta) >= -program.slack).all():
@@ -518,31 +581,40 @@ class StateDependentController(PredictiveController):
         bounds = np.where(open_, -np.inf, low), np.where(open_, np.inf, high)
         return ranked.solve(theta, bounds, guess)
 
-    def _following(
-        self, point: Point, solution: Solution, theta: Array, settling: Settling
-    ) -> Point:
+    def _following(self, each: Pass, theta: Array, settling: Settling) -> Point:
         """Point of the next pass: a full, damped or halved step to the optimum."""
+        point, solution, scheme = each.point, each.solution, settling.scheme
         step = solution.decision - point.z
-        scheme = settling.scheme
         if point.frozen or not np.isfinite(point.cost):
             return self.problem.at(solution.decision, theta, scheme)
-        if scheme == "iterated":
-            share = 1.0 - settling.damping
-            return self.problem.at(point.z + share * step, theta, scheme)
+        share = 1.0 - settling.damping if scheme == "iterated" else 1.0
         price = 4.0 * np.abs(solution.multipliers[self.problem.on_outputs]).max(
             initial=0.0
         )
-        worst = point.cost + price * point.missed
-        # a decrease within rounding cannot be seen: the step is short, take it
+        most = self._most(each, price)
+        trials = []
+        for _ in range(12):
+            z = point.z + share * step
+            trials.append(self.problem.at(z, theta, scheme, solution.multipliers))
+            if self.problem.merit(trials[-1], price) <= most:
+                return trials[-1]
+            share /= 2.0
+        # nothing near is better: the rows bend, or the program does not fit; go on
+        finite = [trial for trial in trials if np.isfinite(trial.cost)]
+        return finite[0] if finite else trials[-1]
+
+    def _most(self, each: Pass, price: float) -> float:
+        """Largest merit that the next point may have."""
+        point, merit = each.point, self.problem.merit(each.point, price)
+        by_rank = each.status is Status.SOFTENED and self.limits.outputs != "soft"
+        if self.settling.scheme == "iterated" or by_rank:
+            return np.finfo(float).max  # anything that has not run away
         slope = point.program.H @ point.z + point.program.f @ point.theta
-        if not point.missed and abs(slope @ step) <= 1e-11 * (1.0 + abs(worst)):
-            return self.problem.at(solution.decision, theta, scheme)
-        for halved in range(12):
-            trial = self.problem.at(point.z + 0.5**halved * step, theta, scheme)
-            merit = trial.cost + (price * trial.missed if price else 0.0)
-            if merit <= worst + 1e-12 * (1.0 + abs(worst)):
-                return trial
-        return trial
+        step = each.solution.decision - point.z
+        room = 1e-12 * (1.0 + abs(merit))
+        if not point.broken.any() and abs(slope @ step) <= 10.0 * room:
+            return np.finfo(float).max  # a decrease within rounding cannot be seen
+        return merit + room
 
     def start_of(
         self, theta: Array, plan: Array | None, settling: Settling | None = None
@@ -581,7 +653,7 @@ class StateDependentController(PredictiveController):
     def _settle(self, theta: Array, plan: Array | None) -> Outcome:
         """Run passes until the plan stops moving, or something else ends them."""
         began, settling = time.perf_counter(), self.settling
-        trace = Trace(settling)
+        trace = Trace(settling, self.problem)
         runaway = self.runaway(theta)
         for each in self.passes(theta, self.start_of(theta, plan)):
             trace.take(each)
@@ -589,8 +661,7 @@ class StateDependentController(PredictiveController):
             if verdict is None:
                 continue
             if verdict in (Status.UNSETTLED, Status.OUT_OF_TIME):
-                last = self._following(each.point, each.solution, theta, settling)
-                trace.consider(last)
+                trace.consider(self._following(each, theta, settling))
             return Outcome(verdict, each, trace.best, len(trace.changes), trace.ratio)
         raise AssertionError("passes have no end")
 
@@ -619,28 +690,60 @@ class StateDependentController(PredictiveController):
         move.iterations[i] = outcome.passes
         if outcome.plan is None:
             LOG.warning("%s", outcome.last.solution.message or outcome.status.sentence)
-            self._continue(move, memory, i, self.last_input(memory.vector[i]))
+            self._fall_back(move, memory, i)
             return
         point, z = outcome.plan
-        layout, known = self._plan_layout, move.known[i]
-        U = self.problem.U.value(z, theta)
         settled = outcome.status not in UNSETTLED
-        known[layout["plan_u"]] = U
-        known[layout["plan_du"]] = self.problem.dU.value(z, theta)
-        known[layout["plan_y"]] = (
-            point.Y.value(z, point.theta) if settled else point.y.ravel()
-        )
+        Y = point.Y.value(z, point.theta) if settled else point.y.ravel()
+        layout, known = self._plan_layout, move.known[i]
         # no nan among what is known: plans are read from it by products
         known[layout["contraction"]] = np.nan_to_num(outcome.ratio)
         known[layout["change"]] = outcome.last.change
         self._keep_law(known, point)
-        move.decision[i], move.u[i] = z, U[: self.model.n_u]
-        move.status[i] = self._told(outcome, z, theta)
+        self._plan(move, i, z, Y, self._told(outcome, z, theta))
         move.cost[i] = point.cost
         if settled:
             move.multipliers[i] = outcome.last.solution.multipliers
             if self.settling.scheme != "newton":  # its Hessian is not that of J
                 move.cost[i] = point.program.cost(z, point.theta)
+        if move.status[i] == Status.GUARDED:
+            self._hold(move, i, Status.GUARDED)
+
+    def _plan(self, move: Move, i: int, z: Array, Y: Array, status: Status) -> None:
+        """Note a plan and its predictions in row i of a move."""
+        layout, known = self._plan_layout, move.known[i]
+        theta = known[: self.problem.known.size]
+        U = self.problem.U.value(z, theta)
+        known[layout["plan_u"]] = U
+        known[layout["plan_du"]] = self.problem.dU.value(z, theta)
+        known[layout["plan_y"]] = np.nan_to_num(Y, posinf=0.0, neginf=0.0)
+        move.decision[i], move.u[i], move.status[i] = z, U[: self.model.n_u], status
+
+    def _fall_back(self, move: Move, memory: Memory, i: int) -> None:
+        """Continue the last plan, or hold the input where there is none.
+
+        A plan that knows no reference (reading "zero") leads away from it: better hold.
+        """
+        theta = move.known[i, : self.problem.known.size]
+        plan = self._shifted_plan(memory, i)
+        if plan is None or self.knowledge.layout.shapes["r"][0] == 0:
+            self._hold(move, i, Status.HELD)
+            move.shift[i] = -1
+            return
+        z = self.problem.from_inputs(self.kept_within(plan, theta), theta)
+        self._carry_out(move, i, z, Status.SHIFTED)
+
+    def _hold(self, move: Move, i: int, status: Status) -> None:
+        theta = move.known[i, : self.problem.known.size]
+        rest = np.tile(theta[self.problem.known["u"]], (self.horizon.Np, 1))
+        self._carry_out(move, i, self.problem.from_inputs(rest, theta), status)
+
+    def _carry_out(self, move: Move, i: int, z: Array, status: Status) -> None:
+        """Note a plan that no program was solved for, with its true cost."""
+        theta = move.known[i, : self.problem.known.size]
+        point = self.problem.at(z, theta, "gauss-newton")
+        self._plan(move, i, z, point.y.ravel(), status)
+        move.cost[i] = np.nan_to_num(point.cost, posinf=0.0)
 
     def _told(self, outcome: Outcome, z: Array, theta: Array) -> Status:
         """Status of a plan, and whether one of the opposite sign would do as well."""
@@ -654,22 +757,29 @@ class StateDependentController(PredictiveController):
         return outcome.status
 
     def _mirrored(self, point: Point, z: Array, theta: Array) -> bool:
-        """Whether inputs of the opposite sign are allowed and cost the same."""
+        """Whether inputs of the opposite sign are allowed and do exactly the same."""
         U = self.problem.U.value(z, theta).reshape(self.horizon.Np, -1)
-        if np.abs(U).max() < 1e-6:
+        size, before = np.abs(U).max(), theta[self.problem.known["u"]]
+        if not size > 1e-9 * (1.0 + np.abs(before).max()):
             return False
-        before = theta[self.problem.known["u"]]
-        if np.abs(self.clip(-U[0], before) + U[0]).max() > 1e-9:
+        if not np.abs(self.clip(-U[0], before) + U[0]).max() <= 1e-9 * size:
+            return False
+        if not np.abs(self.kept_within(-U, theta) + U).max() <= 1e-9 * size:
             return False
         other = self.problem.from_inputs(-U, theta)
-        if not np.allclose(self.kept_within(-U, theta), -U, atol=1e-9):
-            return False
         twin = self.problem.at(other, theta, self.settling.scheme)
-        return bool(abs(twin.cost - point.cost) <= 1e-7 * (1.0 + abs(point.cost)))
+        moved = np.abs(point.Y.gain @ z).max()
+        apart = np.abs(twin.y - point.y).max()
+        alike = abs(twin.cost - point.cost) <= 1e-7 * abs(point.cost)
+        return bool(alike and apart <= 1e-6 * moved)
 
     def _last_plan(self, memory: Memory, i: int) -> Array | None:
-        """Give inputs of the last plan from this sample on, its last value repeated."""
-        if memory.shift[i] < 0 or not self.settling.warm_start:
+        """Give the plan that passes begin with, if they begin with the last one."""
+        return self._shifted_plan(memory, i) if self.settling.warm_start else None
+
+    def _shifted_plan(self, memory: Memory, i: int) -> Array | None:
+        """Shift the inputs of the last plan to this sample, its last value repeated."""
+        if memory.shift[i] < 0:
             return None
         Np = self.horizon.Np
         plan = memory.known[i, self._plan_layout["plan_u"]].reshape(Np, -1)
@@ -690,11 +800,14 @@ class StateDependentController(PredictiveController):
             return
         program, n_u, p = point.program, self.model.n_u, self.model.n_y
         x = self.problem.known["x"]
-        right = np.column_stack(
-            [program.f @ point.theta, program.f[:, x.stop - p : x.stop]]
-        )
-        law = -np.linalg.solve(program.H, right)[:n_u]
-        known[layout["free_u"]], known[layout["law"]] = law[:, 0], law[:, 1:].ravel()
+        if "terminal" in program.rows:
+            gain = program.free[:n_u]
+            free, on_sum = gain @ point.theta, gain[:, x.stop - p : x.stop]
+        else:
+            right = [program.f @ point.theta, program.f[:, x.stop - p : x.stop]]
+            law = -np.linalg.solve(program.H, np.column_stack(right))[:n_u]
+            free, on_sum = law[:, 0], law[:, 1:]
+        known[layout["free_u"]], known[layout["law"]] = free, on_sum.ravel()
 
     def _followed(self, memory: Memory, u: Array, move: Move) -> Array:
         layout = self._plan_layout
@@ -755,8 +868,8 @@ class Outcome:
 class Trace:
     """What the passes of a sample have shown so far."""
 
-    def __init__(self, settling: Settling) -> None:
-        self.settling = settling
+    def __init__(self, settling: Settling, problem: Problem) -> None:
+        self.settling, self.problem = settling, problem
         self.changes: list[float] = []
         self.plans: list[Array] = []
         self.best: Point | None = None
@@ -774,7 +887,8 @@ class Trace:
         """Keep the better of two plans: the lower cost among the least broken."""
         if not np.isfinite(point.cost):
             return
-        if self.best is None or _merit(point) < _merit(self.best):
+        standing = self.problem.standing
+        if self.best is None or standing(point) < standing(self.best):
             self.best = point
 
     @property
@@ -791,7 +905,8 @@ class Trace:
         assert each is not None
         point, settling = each.point, self.settling
         if not each.solution.found:
-            return Status.DIVERGED if self.best is not None else Status.HELD
+            away = self.best is not None and not np.isfinite(point.cost)
+            return Status.DIVERGED if away else Status.HELD
         if settling.scheme == "frozen":
             return each.status
         small = settling.tolerance * (1.0 + np.abs(each.solution.decision).max())
@@ -815,8 +930,13 @@ class Trace:
         return bool(near < 1e-4 * far)
 
 
-def _merit(point: Point) -> tuple[float, float]:
-    return round(point.missed, 9), point.cost
+def _free_optimum(program: QuadraticProgram, theta: Array) -> Array:
+    """Optimum of a program without limits, a terminal equality kept."""
+    if "terminal" in program.rows:
+        return program.free @ theta
+    return -scipy.linalg.cho_solve(
+        scipy.linalg.cho_factor(program.H), program.f @ theta
+    )
 
 
 def sdp_integral_of_error(
@@ -857,11 +977,12 @@ def sdp_integral_of_error(
     ValueError
         If a weight or limit has a wrong shape or sign, or an argument is unknown.
     """
+    check_equation(model)
     form = integral_of_error_form(model.wide)
     kept = thesis_state(model, form.n_x)
     weight_x = weight("Q", Q, horizon.Np, len(kept))
     weight_u = weight("R", R, horizon.Nc, model.n_u)
-    _check_weights(weight_x, weight_u)
+    check_signs(weight_x, weight_u)
     spread = np.kron(np.eye(horizon.Np), np.eye(form.n_x)[kept])
     weight_x = spread.T @ weight_x @ spread
     parts = model, form, horizon, reference, weight_x, weight_u
@@ -906,10 +1027,11 @@ def sdp_increments(
             'reference = "zero" leaves nothing to follow: use "held", "next" or '
             '"preview"'
         )
+    check_equation(model)
     form = past_form(model.wide)
     weight_y = weight("Q", Q, horizon.Np, model.n_y)
     weight_du = weight("R", R, horizon.Nc, model.n_u)
-    _check_weights(weight_y, weight_du)
+    check_signs(weight_y, weight_du)
     parts = model, form, horizon, reference, weight_y, weight_du
     return _build(*parts, limits, settling, terminal, backend, True, offset_free)
 
@@ -937,6 +1059,11 @@ def _build(
 ) -> StateDependentController:
     if terminal not in ("none", "equality"):
         raise ValueError(f'terminal = "{terminal}": expected "none" or "equality"')
+    if settling is not None and not isinstance(settling, Settling):
+        raise ValueError(
+            f"settling = {settling!r}: expected a Settling, such as "
+            'Settling("gauss-newton")'
+        )
     find_backend(backend)
     limits = limits or Limits()
     setup = Setup(
@@ -956,7 +1083,7 @@ def _build(
         problem.template,
         signals,
         knowledge,
-        output_ranks(problem.template, limits, model.n_y),
+        problem.ranks,
         backend,
         equation=model,
         settling=settling or Settling(),
@@ -986,16 +1113,6 @@ def _knowledge(setup: Setup, integral: bool) -> Knowledge:
         np.pad(base.from_r, room),
         np.pad(base.from_v, room),
     )
-
-
-def _check_weights(weight_x: Array, weight_z: Array) -> None:
-    for name, matrix, least in (("Q", weight_x, -1e-12), ("R", weight_z, 1e-12)):
-        smallest = float(np.linalg.eigvalsh(matrix)[0])
-        if smallest < least * max(1.0, np.abs(matrix).max()):
-            wanted = "not be negative" if name == "Q" else "be positive"
-            raise ValueError(
-                f"{name} has the eigenvalue {smallest:.4g}; all of them must {wanted}"
-            )
 
 
 def _parts(record: Memory) -> list[Array]:

@@ -23,7 +23,7 @@ from nmss_lab.models import Array, DifferenceModel, Numbers
 Parameter = float | str | Callable[[Array, Array], Array]
 """A coefficient: a number, a text such as ``"0.3*y[k-1]"``, or a function of past
 outputs (..., lags, n_y) and inputs (..., lags, n_u), the most recent first, that
-returns (...)."""
+returns (...); it must accept complex numbers where derivatives are taken."""
 
 TINY = 1e-30
 """Step of the complex-step derivative: nothing is subtracted, so it may be tiny."""
@@ -238,7 +238,10 @@ class StateDependentModel:
                 tables[name] = np.empty(shape, dtype=kind)
                 tables[name][...] = self._constant[name]
             spot: Any = (..., *where)
-            tables[name][spot] = function(y, u)
+            value = function(y, u)
+            if not isinstance(function, Expression):
+                _check_value(f"{name}{list(where)}", value, y.shape[:-2])
+            tables[name][spot] = value
         return tables["a"], tables["b"]
 
     def step(self, y: Array, u: Array) -> Array:
@@ -328,6 +331,8 @@ class StateDependentModel:
             ``-a`` and ``b`` are the derivatives by past outputs and inputs.
         """
         slopes = self._complex_slopes(y, u)
+        if self._doubtful:
+            self._check_slopes(y, u, slopes)
         n = self.y_lags * self.n_y
         lead = y.shape[:-2]
         by_y = slopes[..., :n].reshape(*lead, self.n_y, self.y_lags, self.n_y)
@@ -353,6 +358,35 @@ class StateDependentModel:
         symmetric: Array = (hessian + np.swapaxes(hessian, -1, -2)) / 2.0
         return symmetric
 
+    @cached_property
+    def _doubtful(self) -> bool:
+        """Whether a coefficient is a function that may not accept complex numbers."""
+        return any(not isinstance(f, Expression) for _, _, f in self.varying)
+
+    def _check_slopes(self, y: Array, u: Array, slopes: Array) -> None:
+        """Compare with differences; a function may drop the imaginary part.
+
+        Raises
+        ------
+        ValueError
+            If they disagree.
+        """
+        flat = _flat(y, u)
+        step = 1e-6 * (1.0 + np.abs(flat))
+        for j in range(flat.shape[-1]):
+            change = np.zeros_like(flat)
+            change[..., j] = step[..., j]
+            ends = (self.step(*self._split(flat + s * change)) for s in (1, -1))
+            above, below = ends
+            slope = (above - below) / (2.0 * step[..., j : j + 1])
+            apart = np.abs(slope - slopes[..., j])
+            if (apart > 1e-3 * (1.0 + np.abs(slope))).any():
+                raise ValueError(
+                    "a coefficient is a function whose derivative cannot be taken by a "
+                    "complex step: it drops the imaginary part, as abs and comparisons "
+                    "do, or has a kink here; write it as a text, or without them"
+                )
+
     def _complex_slopes(self, y: Array, u: Array) -> Array:
         """Differentiate all past values, (..., n_y, m)."""
         flat = _flat(y, u)
@@ -361,7 +395,13 @@ class StateDependentModel:
             m, *(1,) * (flat.ndim - 1), m
         )
         with np.errstate(all="ignore"):
-            slopes = self.step(*self._split(moved)).imag / TINY
+            try:
+                slopes = self.step(*self._split(moved)).imag / TINY
+            except TypeError as error:
+                raise ValueError(
+                    f"a coefficient is a function that does not accept complex numbers "
+                    f"({error}), which derivatives need; write it as a text"
+                ) from error
         return np.moveaxis(slopes, 0, -1)
 
     def _split(self, flat: Array) -> tuple[Array, Array]:
@@ -380,6 +420,8 @@ class StateDependentModel:
         """
         u = np.asarray(u, dtype=float)
         u = u[:, None] if u.ndim == 1 else u
+        if u.ndim < 2 or u.shape[-1] != self.n_u or not u.shape[-2]:
+            raise ValueError(f"u has shape {u.shape}, expected (..., N, {self.n_u})")
         y, past = self._constant_past(y0, u0)
         lead = u.shape[:-2]
         y = np.broadcast_to(y, (*lead, *y.shape))
@@ -387,8 +429,16 @@ class StateDependentModel:
         return np.concatenate([y[..., :1, :], ahead], axis=-2)
 
     def _constant_past(self, y0: Numbers, u0: Numbers) -> tuple[Array, Array]:
-        y = np.broadcast_to(np.asarray(y0, float), (self.y_lags, self.n_y))
-        return y, np.broadcast_to(np.asarray(u0, float), (self.u_lags, self.n_u))
+        past = []
+        for name, value, lags, size in (
+            ("y0", y0, self.y_lags, self.n_y),
+            ("u0", u0, self.u_lags, self.n_u),
+        ):
+            start = np.asarray(value, dtype=float)
+            if start.shape not in ((), (1,), (size,)):
+                raise ValueError(f"{name} has shape {start.shape}, expected ({size},)")
+            past.append(np.broadcast_to(start, (lags, size)))
+        return past[0], past[1]
 
     def rest(self, u0: Numbers, near: Numbers = 1.0) -> Array:
         """Output (n_y,) at rest under a constant input; there may be several.
@@ -521,6 +571,15 @@ def _lengths(name: str, value: Any) -> Iterator[int]:
         level = [inner for entry in level for inner in entry]
         if not level:
             return
+
+
+def _check_value(label: str, value: Any, lead: tuple[int, ...]) -> None:
+    """Check that a function has kept the leading axes of what it was given."""
+    if np.shape(value) not in ((), lead):
+        raise ValueError(
+            f"{label} returned shape {np.shape(value)}, expected {lead}: past values "
+            "come as (..., lags, channels), so write y[..., 0, 0] for y[k-1]"
+        )
 
 
 def _nested(table: Array) -> tuple[Any, ...]:

@@ -8,7 +8,9 @@ import pytest
 from nmss_lab import Design, DifferenceModel, Horizon, Limits, Record, Scenario
 from nmss_lab.files import Study, dumps, load, loads, save
 from nmss_lab.predictive import PredictiveController
+from nmss_lab.sdp_mpc import Settling
 from nmss_lab.simulate import closed_loop
+from nmss_lab.state_dependent import StateDependentModel, StateDependentPlant
 
 
 def study() -> Study:
@@ -108,3 +110,39 @@ def test_controller_of_a_loaded_run_predicts():
     opened = loads(dumps(study()))
     assert isinstance(opened.run.controller, PredictiveController)
     assert opened.run.controller.horizon.blocks == (1, 1, 2, 3)
+
+
+def varying_study(b="c*u[k-2]", structure="sdp_increments") -> Study:
+    """Make a run of a state-dependent design, settled in its own way."""
+    model = StateDependentModel(
+        [-0.7], [b], y_names=["T"], units={"T": "K"}, constants={"c": 1.0}, u_lags=2
+    )
+    options = {"settling": Settling("newton", passes=20)}
+    limits = Limits(u=(-0.8, 0.8))
+    design = Design(structure, model, Horizon(6, 4), 0.1, 1.0, limits, options=options)
+    scenario = Scenario(np.r_[np.ones(3), np.full(9, 2.0)], y0=1.0, u0=0.5)
+    plant = StateDependentPlant(model, 0.02)
+    return Study(design, plant, scenario, closed_loop(plant, design.build(), scenario))
+
+
+@pytest.mark.parametrize("structure", ["sdp_increments", "sdp_integral_of_error"])
+def test_a_state_dependent_study_comes_back(tmp_path, structure):
+    """Texts, constants, the way to settle, load and run: the same numbers."""
+    before = varying_study(structure=structure)
+    save(tmp_path / "study.json", before)
+    after = load(tmp_path / "study.json")
+    assert after.design.options["settling"] == Settling("newton", passes=20)
+    assert after.design.model.b == before.design.model.b
+    assert after.design.model.units == {"T": "K"}
+    for name in ("y", "u", "status", "iterations"):
+        assert np.array_equal(getattr(after.run, name), getattr(before.run, name))
+    assert np.array_equal(after.run.trail("y"), before.run.trail("y"))
+    again = closed_loop(after.plant, after.design.build(), after.scenario)
+    assert np.array_equal(again.u, before.run.u)
+
+
+def test_a_coefficient_that_is_a_function_is_refused():
+    """A file holds data; a text would do."""
+    study = varying_study(lambda y, u: u[..., 1, 0])
+    with pytest.raises(ValueError, match=r"content\.design\.model\.b.* function"):
+        dumps(study)

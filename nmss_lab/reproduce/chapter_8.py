@@ -675,7 +675,8 @@ def _shifted_misses(run: Run) -> Array:
         plan, theta = run.trail("u")[k - 1], _theta(run, k)
         plan = controller.kept_within(np.vstack([plan[1:], plan[-1:]]), theta)
         _, y = problem.rolled(problem.from_inputs(plan, theta), theta)
-        missed.append(problem.missed(y, theta))
+        beyond = np.abs(y) - controller.limits.of("y", 1)[1]
+        missed.append(float(np.maximum(beyond, 0.0).sum()))
     return np.array(missed)
 
 
