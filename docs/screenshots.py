@@ -15,7 +15,11 @@ from pathlib import Path
 from playwright.sync_api import Page, sync_playwright
 
 HERE = Path(__file__).resolve().parent
-VIEWS = {"receding_horizon": ("?gain=20", 22, True), "governor": ("", 34, False)}
+VIEWS = {
+    "receding_horizon": ("?gain=20", 22, True),
+    "governor": ("", 34, False),
+    "state_dependent": ("?structures=frozen,iterated", 9, True),
+}
 """Page: choices in its address, sample shown, whether past plans are drawn."""
 
 
@@ -37,10 +41,11 @@ def take(page: Page, url: str, name: str) -> None:
     choices, sample, past = VIEWS[name]
     page.goto(f"{url}{name}{choices}")
     page.wait_for_function("window.nmssPlayer?.frames > 0")
-    page.get_by_role("slider", name="Sample").fill(str(sample))
+    page.get_by_role("slider", name="Sample", exact=True).fill(str(sample))
     if past:
         page.get_by_label("Past plans").check()
     page.mouse.move(0, 0)
+    page.evaluate("scrollTo(0, 0)")
     page.wait_for_timeout(1000)
     page.screenshot(path=HERE / f"{name}.png")
 
