@@ -431,7 +431,8 @@ def shares(runs: Sequence[Run]) -> Share:
     settled = share(*SETTLED)
     cycled, diverged = share(Status.CYCLED), share(Status.DIVERGED)
     unsettled = share(Status.UNSETTLED, Status.OUT_OF_TIME)
-    other = max(0.0, 1.0 - settled - cycled - diverged - unsettled)
+    rest = share(Status.CLIPPED, Status.REFUSED, Status.SHIFTED, Status.HELD)
+    other = rest + share(Status.GUARDED)
     return Share(
         len(status), settled, cycled, unsettled, diverged, other, float(passes.mean())
     )

@@ -176,8 +176,9 @@ class Chart:
         if self.log:
             return _decades(values[values > 0.0])
         low, high = float(values.min()), float(values.max())
-        if self.counts:
-            low, high = 0.0, max(high, 1.0)
+        if self.counts:  # counted from nothing, with a little room for the line
+            _, top = _rounded(0.0, max(high, 1.0))
+            return -0.04 * top, top
         size = max(high - low, 1e-9 * (1.0 + abs(high)))
         near = [x for x in self.limits if low - 2 * size <= x <= high + 2 * size]
         low, high = min([low, *near]), max([high, *near])
