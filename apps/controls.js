@@ -226,9 +226,13 @@ export function render({ model, el }) {
   window.addEventListener("nmss-look", look)
   model.on("remove", () => window.removeEventListener("nmss-look", look))
 
-  let stale = false
-  model.on("form", () => { stale = true })
-  model.on("state", () => {
+  // Values that belong to a form which is still on its way wait for it
+  let stale = false, held = false
+  model.on("form", () => { stale = true; if (held) answered() })
+  model.on("state", () => answered())
+  const answered = () => {
+    held = "form" in model.state && model.state.form !== model.form.number
+    if (held) return
     const answer = model.state.message
     if (waiting !== null && answer < waiting) return
     waiting = null
@@ -240,7 +244,7 @@ export function render({ model, el }) {
     if (changed) { send(); return }
     take()
     writeAddress()
-  })
+  }
 
   // A new form has values of its own; what was touched while it was on its way stays
   // only where its control is still the same one.

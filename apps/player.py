@@ -26,7 +26,8 @@ class Controls(JSComponent):
     """A form made from a description of choices.
 
     ``form`` and ``state`` come from the server: "groups" and "defaults", and "values"
-    and the number of the "message" they answer; ``form`` is set before ``state``.
+    and the number of the "message" they answer; ``form`` is set before ``state``, or
+    has a "number" which ``state`` names as "form".
     ``sent`` goes to the server: all values and the number of the "message".
     """
 

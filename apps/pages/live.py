@@ -76,6 +76,7 @@ class LivePage:
     def __init__(self, subject: Subject) -> None:
         self.subject = subject
         self.choices = subject.choices()
+        self._forms = 0
         self.complaint = _from_address(self.choices)
         self.lead, self.alert, self.measures, self.python, self.notes = (
             _text(name) for name in ("lead", "alert", "measures", "python", "notes")
@@ -167,10 +168,17 @@ class LivePage:
 
     def _form(self) -> dict[str, Any]:
         choices = self.choices
-        return {"groups": choices.description(), "defaults": choices.defaults()}
+        self._forms += 1
+        return {
+            "groups": choices.description(),
+            "defaults": choices.defaults(),
+            "number": self._forms,
+        }
 
     def _state(self, message: int) -> dict[str, Any]:
-        return {"values": self.choices.values(), "message": message}
+        """Values for the latest form, which the browser waits for."""
+        values = self.choices.values()
+        return {"values": values, "message": message, "form": self._forms}
 
     def _tell(self) -> None:
         """Words around the plots."""
