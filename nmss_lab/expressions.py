@@ -93,6 +93,11 @@ class Expression:
         """Deepest lag of an input that is read, 0 for none."""
         return self._parsed[1]["u"]
 
+    @property
+    def bare(self) -> Value:
+        """What ``__call__`` evaluates, without its care for kinds and shapes."""
+        return self._parsed[0]
+
     def __call__(self, y: Array, u: Array) -> Array:
         """Evaluate at past values, for all leading axes at once.
 
@@ -278,7 +283,10 @@ class _Reader:
         letter, channel = self.names[name]
         self.lags[letter] = max(self.lags[letter], lag)
         where = (..., lag - 1, channel)
-        return (lambda y, u: y[where]) if letter == "y" else (lambda y, u: u[where])
+        # a number is calculated with faster than an array of no dimension: [()]
+        if letter == "y":
+            return lambda y, u: y[where][()]
+        return lambda y, u: u[where][()]
 
     def _is(self, name: str, *kinds: str) -> bool:
         return name in self.names and self.names[name][0] in kinds

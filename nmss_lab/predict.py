@@ -57,6 +57,11 @@ class Affine:
         """Return some rows of the signal."""
         return Affine(self.gain[rows], self.known[rows])
 
+    @property
+    def table(self) -> Array:
+        """Gain and known side by side, (rows, n_z + n_theta)."""
+        return np.concatenate([self.gain, self.known], axis=1)
+
     def __len__(self) -> int:
         """Return the number of rows."""
         return self.gain.shape[0]
@@ -158,11 +163,24 @@ def predict(
             f"A, B, inputs and offsets have {len(A)}, {len(B)}, {len(inputs)} and "
             f"{len(offsets)} steps; expected the same number, Np"
         )
-    states = []
-    for a, b, nu, e in zip(A, B, inputs, offsets, strict=True):
-        state = a @ state + b @ nu + e  # now x_{k+i+1} in terms of z and theta
-        states.append(state)
-    return stack(states)
+    nu, e = tables(inputs), tables(offsets)
+    X = run_forward(np.stack(A), np.stack(B), state.table, nu, e)
+    n_z = state.gain.shape[1]
+    return Affine(X[:, :n_z].copy(), X[:, n_z:].copy())
+
+
+def tables(signals: Sequence[Affine]) -> Array:
+    """Tables of signals of the same length, (steps, rows, n_z + n_theta)."""
+    return np.stack([signal.table for signal in signals])
+
+
+def run_forward(A: Array, B: Array, state: Array, inputs: Array, e: Array) -> Array:
+    """Do what ``predict`` does with tables of the signals, and return one."""
+    states = B @ inputs + e
+    for a, following in zip(A, states, strict=True):
+        following += a @ state  # now x_{k+i+1} in terms of z and theta
+        state = following
+    return states.reshape(-1, states.shape[2])
 
 
 @dataclass(frozen=True)

@@ -220,7 +220,7 @@ def sum_of_squares(costs: Sequence[Cost]) -> Array:
     """Sum of all costs as one symmetric matrix on [z; theta]."""
     total: Array = np.zeros(())
     for cost in costs:
-        both = np.hstack([cost.signal.gain, cost.signal.known])
+        both = cost.signal.table
         total = total + both.T @ cost.weight @ both
     return (total + total.T) / 2.0
 

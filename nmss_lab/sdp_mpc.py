@@ -33,7 +33,15 @@ from nmss_lab.models import Array
 from nmss_lab.mpc import Reading, Setup, Terminal
 from nmss_lab.nmss import Form, Layout, integral_of_error_form, past_form
 from nmss_lab.pip import check_signs
-from nmss_lab.predict import Affine, Horizon, blocks, known_part, predict, stack
+from nmss_lab.predict import (
+    Affine,
+    Horizon,
+    blocks,
+    known_part,
+    run_forward,
+    stack,
+    tables,
+)
 from nmss_lab.predictive import (
     Knowledge,
     PredictiveController,
@@ -217,9 +225,14 @@ class Problem:
         self.limits, self.terminal = limits, terminal
         self.known, self.horizon = setup.known, setup.horizon
         self.U, self.dU = setup.increments() if increments else setup.levels()
-        self._inputs = blocks(self.U, equation.n_u)
-        self._state = known_part(self.known, "x", setup.n_z)
-        self._offsets = self._offset_signals()
+        # what is the same in every pass
+        self._inputs = tables(blocks(self.U, equation.n_u))
+        self._state = known_part(self.known, "x", setup.n_z).table
+        self._offsets = tables(self._offset_signals())
+        self._A, self._B = (
+            np.repeat(part[None], self.horizon.Np, 0)
+            for part in (setup.form.A, setup.form.B)
+        )
         self._reference = setup.stacked_reference()
         self._lay_out_rows()
 
@@ -279,8 +292,7 @@ class Problem:
         form, p = self.setup.form, self.equation.n_y
         steps, na = a.shape[:2]
         nb, q = b.shape[1], self.equation.n_u
-        A = np.broadcast_to(form.A, (steps, *form.A.shape)).copy()
-        B = np.broadcast_to(form.B, (steps, *form.B.shape)).copy()
+        A, B = self._A.copy(), self._B.copy()
         wide = self.equation.y_lags * p
         A[:, :p, : na * p] = -a.swapaxes(1, 2).reshape(steps, p, na * p)
         past = b[:, 1:].swapaxes(1, 2).reshape(steps, p, (nb - 1) * q)
@@ -335,7 +347,8 @@ class Problem:
             return self._ran_away(z, theta, U, outputs)
         A, B = self._matrices(a, b)
         with np.errstate(all="ignore"):  # looked at just below
-            X = predict(list(A), list(B), self._state, self._inputs, self._offsets)
+            both = run_forward(A, B, self._state, self._inputs, self._offsets)
+            X = Affine(both[:, : self.setup.n_z], both[:, self.setup.n_z :])
             Y = self._outputs_of(X)
             program = self._program(X, Y)
             size = np.abs(program.H).max() + np.abs(program.f @ theta).max()
@@ -346,11 +359,7 @@ class Problem:
                 multipliers = np.zeros(len(self.template.labels))
             price = self._prices(program, z, theta, multipliers)
             program = self._with_curvature(program, z, price, X, seen)
-        cost = (
-            float(program.cost(z, theta))
-            if scheme != "newton"
-            else self._cost(z, theta, X, Y)
-        )
+        cost = self._cost(z, theta, X, Y)
         broken = self._broken(program, z, theta)
         return Point(z, theta, program, Y, U, outputs, cost, broken, frozen)
 
@@ -445,6 +454,7 @@ class Problem:
         return np.concatenate([states[:, :y], inputs, states[:, y : y + u]], axis=1)
 
     def _cost(self, z: Array, theta: Array, X: Affine, Y: Affine) -> float:
+        """J from what is weighed: ``program.cost`` loses digits where y is large."""
         weighed = Y - self._reference if self.increments else X
         value = weighed.value(z, theta)
         return float(value @ self.weight_x @ value + z @ self.weight_z @ z)
@@ -934,9 +944,11 @@ def _free_optimum(program: QuadraticProgram, theta: Array) -> Array:
     """Optimum of a program without limits, a terminal equality kept."""
     if "terminal" in program.rows:
         return program.free @ theta
-    return -scipy.linalg.cho_solve(
-        scipy.linalg.cho_factor(program.H), program.f @ theta
-    )
+    _, z, wrong = scipy.linalg.lapack.dposv(program.H, -program.f @ theta)
+    if wrong:
+        raise np.linalg.LinAlgError("the Hessian is not positive definite")
+    optimum: Array = z
+    return optimum
 
 
 def sdp_integral_of_error(

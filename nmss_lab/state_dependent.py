@@ -175,16 +175,20 @@ class StateDependentModel:
         ]
 
     @cached_property
-    def _constant(self) -> dict[str, Array]:
-        tables = self._parsed  # type: ignore[attr-defined]
-
-        def number(entry: Any) -> float:
-            return 0.0 if callable(entry) else float(entry)
-
-        return {
-            name: np.vectorize(number, otypes=[float])(table)
-            for name, table in tables.items()
-        }
+    def _row_parts(self) -> tuple[Array, list[tuple[Any, str, Any]]]:
+        """Rows [a b] (n_y, na n_y + nb n_u): the constants, and what is put in."""
+        constant = np.zeros((self.n_y, self.na * self.n_y + self.nb * self.n_u))
+        varying: list[tuple[Any, str, Any]] = []
+        for name, table in self._parsed.items():  # type: ignore[attr-defined]
+            begin = 0 if name == "a" else self.na * self.n_y
+            for (lag, i, j), entry in np.ndenumerate(table):
+                column = begin + lag * table.shape[2] + j
+                if callable(entry):
+                    label = f"{name}{[lag, i, j]}"
+                    varying.append(((..., i, column), label, entry))
+                else:
+                    constant[i, column] = entry
+        return constant, varying
 
     @cached_property
     def wide(self) -> DifferenceModel:
@@ -220,35 +224,47 @@ class StateDependentModel:
         -------
         a, b : arrays (..., na, n_y, n_y), (..., nb, n_y, n_u)
             Not finite where a function is not.
-        """
-        a, b = self._tables(y, u)
-        lead = y.shape[:-2]
-        return (
-            np.broadcast_to(a, (*lead, *a.shape[-3:])),
-            np.broadcast_to(b, (*lead, *b.shape[-3:])),
-        )
 
-    def _tables(self, y: Array, u: Array) -> tuple[Array, Array]:
-        """Coefficients; those of a table that is constant have no leading axes."""
-        tables = dict(self._constant)
-        for name, where, function in self.varying:
-            if tables[name] is self._constant[name]:
-                kind = complex if "c" in (y.dtype.kind, u.dtype.kind) else float
-                shape = (*y.shape[:-2], *tables[name].shape)
-                tables[name] = np.empty(shape, dtype=kind)
-                tables[name][...] = self._constant[name]
-            spot: Any = (..., *where)
-            value = function(y, u)
-            if not isinstance(function, Expression):
-                _check_value(f"{name}{list(where)}", value, y.shape[:-2])
-            tables[name][spot] = value
-        return tables["a"], tables["b"]
+        Raises
+        ------
+        ValueError
+            If there are not as many past values as coefficients read.
+        """
+        for name, past, lags, size in (
+            ("y", y, self.y_lags, self.n_y),
+            ("u", u, self.u_lags, self.n_u),
+        ):
+            if past.ndim < 2 or past.shape[-2] < lags or past.shape[-1] != size:
+                raise ValueError(
+                    f"{name} has shape {past.shape}, expected (..., {lags}, {size})"
+                )
+        with np.errstate(all="ignore"):
+            return self._split_rows(self._rows(y, u), self.na, self.nb)
+
+    def _rows(self, y: Array, u: Array) -> Array:
+        """Rows [a b] (..., n_y, na n_y + nb n_u), see ``coefficients``."""
+        constant, varying = self._row_parts
+        kind = complex if "c" in (y.dtype.kind, u.dtype.kind) else float
+        rows = np.empty((*y.shape[:-2], *constant.shape), dtype=kind)
+        rows[...] = constant
+        for where, label, entry in varying:
+            value = getattr(entry, "bare", entry)(y, u)
+            if not isinstance(entry, Expression):
+                _check_value(label, value, y.shape[:-2])
+            rows[where] = value
+        return rows
+
+    def _split_rows(self, rows: Array, na: int, nb: int) -> tuple[Array, Array]:
+        """Coefficients a (..., na, n_y, n_y), b (..., nb, n_y, n_u) from [a b]."""
+        n, lead = na * self.n_y, rows.shape[:-1]
+        a = rows[..., :n].reshape(*lead, na, self.n_y)
+        b = rows[..., n:].reshape(*lead, nb, self.n_u)
+        return a.swapaxes(-2, -3), b.swapaxes(-2, -3)
 
     def step(self, y: Array, u: Array) -> Array:
         """Output y_k (..., n_y) that follows past values, see ``coefficients``."""
-        a, b = self._tables(y, u)
-        past_y, past_u = y[..., : self.na, :, None], u[..., : self.nb, :, None]
-        following: Array = ((b @ past_u).sum(-3) - (a @ past_y).sum(-3))[..., 0]
+        past = _flat(-y[..., : self.na, :], u[..., : self.nb, :])
+        following: Array = (self._rows(y, u) @ past[..., None])[..., 0]
         return following
 
     def frozen(self, y: Array, u: Array) -> DifferenceModel:
@@ -279,18 +295,18 @@ class StateDependentModel:
         array (..., N, n_y)
             Grows without bound, to infinity or to nan, where the plant does.
         """
-        inputs = self._inputs(u, ahead)
         lags, steps = self.y_lags, ahead.shape[-2]
+        inputs = self._inputs(u, ahead)[..., ::-1, :]  # the last one first
         outputs = np.empty(
-            (*ahead.shape[:-2], lags + steps, self.n_y), np.result_type(y, u, ahead)
+            (*ahead.shape[:-2], steps + lags, self.n_y), np.result_type(y, u, ahead)
         )
-        outputs[..., :lags, :] = y[..., :lags, :][..., ::-1, :]
+        outputs[..., steps:, :] = y[..., :lags, :]
         with np.errstate(all="ignore"):  # what runs away is told by its size
-            for i in range(steps):
-                past_y = outputs[..., i : i + lags, :][..., ::-1, :]
-                past_u = inputs[..., i : i + self.u_lags, :][..., ::-1, :]
-                outputs[..., lags + i, :] = self.step(past_y, past_u) + load
-        return outputs[..., lags:, :]
+            for i in reversed(range(steps)):
+                past_y = outputs[..., i + 1 : i + 1 + lags, :]
+                past_u = inputs[..., i : i + self.u_lags, :]
+                outputs[..., i, :] = self.step(past_y, past_u) + load
+        return outputs[..., :steps, :][..., ::-1, :]
 
     def windows(
         self, y: Array, u: Array, outputs: Array, ahead: Array
@@ -316,7 +332,8 @@ class StateDependentModel:
     def _inputs(self, u: Array, ahead: Array) -> Array:
         """Put inputs in the order of time, those before sample k first."""
         before = u[..., : self.u_lags - 1, :][..., ::-1, :]
-        before = np.broadcast_to(before, (*ahead.shape[:-2], *before.shape[-2:]))
+        if before.ndim < ahead.ndim:  # one past for many runs
+            before = np.broadcast_to(before, (*ahead.shape[:-2], *before.shape[-2:]))
         return np.concatenate([before, ahead], axis=-2)
 
     def derivative(self, y: Array, u: Array) -> tuple[Array, Array]:
@@ -333,11 +350,8 @@ class StateDependentModel:
         slopes = self._complex_slopes(y, u)
         if self._doubtful:
             self._check_slopes(y, u, slopes)
-        n = self.y_lags * self.n_y
-        lead = y.shape[:-2]
-        by_y = slopes[..., :n].reshape(*lead, self.n_y, self.y_lags, self.n_y)
-        by_u = slopes[..., n:].reshape(*lead, self.n_y, self.u_lags, self.n_u)
-        return -np.moveaxis(by_y, -2, -3), np.moveaxis(by_u, -2, -3)
+        by_y, by_u = self._split_rows(slopes, self.y_lags, self.u_lags)
+        return -by_y, by_u
 
     def curvature(self, y: Array, u: Array) -> Array:
         """Second derivatives of ``step``, (..., n_y, m, m).
