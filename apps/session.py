@@ -538,8 +538,8 @@ class Choices(Form):
         raise NotImplementedError
 
 
-class LoopChoices(Choices):
-    """Choices of the page on the receding horizon."""
+class DesignChoices(Choices):
+    """What pages share whose controllers predict: which, how far, and at what price."""
 
     structures = param.ListSelector(
         default=[],
@@ -564,6 +564,35 @@ class LoopChoices(Choices):
         label="Move weight, times the case's R",
         doc="More makes the inputs calmer (R).",
     )
+
+    scale: ClassVar[dict[str, str]] = {
+        **Choices.scale,
+        "weight_y": "log",
+        "weight_move": "log",
+    }
+
+    def designs(self) -> dict[str, Design]:
+        """Chosen structures with the chosen horizons, weights and limits."""
+        if not 1 <= len(self.structures) <= MOST_RUNS:
+            raise ValueError(
+                f"structures: {len(self.structures)} chosen, expected 1 to {MOST_RUNS}"
+            )
+        known, offered = self.example.designs, self.param["structures"].objects
+        for name in self.structures:
+            if name not in known:
+                raise ValueError(
+                    f"structures: this case has no {name!r}; it has "
+                    f"{', '.join(offered)}"
+                )
+        return {name: self._changed(known[name]) for name in self.structures}
+
+    def _changed(self, design: Design) -> Design:
+        raise NotImplementedError
+
+
+class LoopChoices(DesignChoices):
+    """Choices of the page on the receding horizon."""
+
     reading = param.Selector(
         default="case",
         objects=["case", "held", "next", "preview", "zero"],
@@ -572,11 +601,6 @@ class LoopChoices(Choices):
         "or nothing (S = 0).",
     )
 
-    scale: ClassVar[dict[str, str]] = {
-        **Choices.scale,
-        "weight_y": "log",
-        "weight_move": "log",
-    }
     groups: ClassVar[dict[str, tuple[str, ...]]] = {
         "Case": ("case", "structures", "output", "input"),
         "Design": ("Np", "Nc", "weight_y", "weight_move", "reading"),
@@ -599,22 +623,6 @@ class LoopChoices(Choices):
     @property
     def _main_design(self) -> Design:
         return known_case(self.case).designs[_first_choice(self._predictive)[0]]
-
-    def designs(self) -> dict[str, Design]:
-        """Chosen structures with the chosen horizons, weights and limits."""
-        if not 1 <= len(self.structures) <= MOST_RUNS:
-            raise ValueError(
-                f"structures: {len(self.structures)} chosen, expected 1 to {MOST_RUNS}"
-            )
-        for name in self.structures:
-            if name not in self.example.designs:
-                raise ValueError(
-                    f"structures: this case has no {name!r}; it has "
-                    f"{', '.join(self._predictive)}"
-                )
-        return {
-            name: self._changed(self.example.designs[name]) for name in self.structures
-        }
 
     def _changed(self, design: Design) -> Design:
         reading = design.reference if self.reading == "case" else self.reading

@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 import numpy as np
 import param
 
-from apps.session import Choices, known_case, plain
+from apps.session import DesignChoices, known_case, plain
 from nmss_lab.cases import VARYING_CASES, Case, equation_case
 from nmss_lab.convergence import Best, Iterate, best_plan, iterates
 from nmss_lab.design import Design
@@ -63,14 +63,9 @@ class Hasty(StateDependentPlant):
         return super().step(state, u, v)
 
 
-class VaryingChoices(Choices):
+class VaryingChoices(DesignChoices):
     """Choices of the page on state-dependent control."""
 
-    structures = param.ListSelector(
-        default=[],
-        label="Controllers",
-        doc="Up to three side by side: frozen, iterated, or with the true derivatives.",
-    )
     a1 = param.String("-0.9 + 0.1*y[k-1]**2", label="a1", doc="Multiplies y[k-1].")
     a2 = param.String("0", label="a2", doc="Multiplies y[k-2].")
     b1 = param.String("0.3 + 0.2*y[k-1]", label="b1", doc="Multiplies u[k-1].")
@@ -86,24 +81,6 @@ class VaryingChoices(Choices):
         bounds=(1, 40),
         label="Prediction horizon Np",
         doc="Number of samples Np over which the controller predicts.",
-    )
-    Nc = param.Integer(
-        5,
-        bounds=(1, 20),
-        label="Control horizon Nc",
-        doc="Number of moves Nc that are free; after them the input rests.",
-    )
-    weight_y = param.Number(
-        1.0,
-        bounds=(1e-3, 1e3),
-        label="Output weight, times the case's Q",
-        doc="More makes the outputs follow more tightly (Q).",
-    )
-    weight_move = param.Number(
-        1.0,
-        bounds=(1e-3, 1e3),
-        label="Move weight, times the case's R",
-        doc="More makes the inputs calmer (R).",
     )
     damping = param.Number(
         0.5,
@@ -146,14 +123,9 @@ class VaryingChoices(Choices):
         doc="The lower plots show every pass of this sample.",
     )
 
-    scale: ClassVar[dict[str, str]] = {
-        **Choices.scale,
-        "weight_y": "log",
-        "weight_move": "log",
-        "tolerance": "log",
-    }
+    scale: ClassVar[dict[str, str]] = {**DesignChoices.scale, "tolerance": "log"}
     when: ClassVar[dict[str, tuple[str, str]]] = {
-        **Choices.when,
+        **DesignChoices.when,
         **dict.fromkeys(EQUATION, ("case", OWN)),
     }
     groups: ClassVar[dict[str, tuple[str, ...]]] = {
@@ -272,22 +244,6 @@ class VaryingChoices(Choices):
         return super()._word(key, name)
 
     # From choices to runs
-
-    def designs(self) -> dict[str, Design]:
-        """Chosen controllers with the chosen horizons, weights, limits and settling."""
-        if not 1 <= len(self.structures) <= 3:
-            raise ValueError(
-                f"structures: {len(self.structures)} chosen, expected 1 to 3"
-            )
-        for name in self.structures:
-            if name not in self.example.designs:
-                raise ValueError(
-                    f"structures: this case has no {name!r}; it has "
-                    f"{', '.join(self.example.designs)}"
-                )
-        return {
-            name: self._changed(self.example.designs[name]) for name in self.structures
-        }
 
     def _changed(self, design: Design) -> Design:
         design = replace(design, limits=self.limits(design.limits))

@@ -308,6 +308,22 @@ class Controller(ABC):
     def _decide(self, memory: Memory, r: Array, v: Array) -> Move:
         """Decide for memories with a leading axis of loops."""
 
+    def _move(self, u: Array, r: Array, **parts: Array) -> Move:
+        """Move without a plan for inputs u (loops, n_u); ``parts`` replace the rest."""
+        loops = len(u)
+        plain: dict[str, Array] = {
+            "w": r[:, 0].copy(),
+            "governed": r[:, 0].copy(),
+            "decision": np.zeros((loops, self.n_z)),
+            "known": np.zeros((loops, self.n_theta)),
+            "status": np.full(loops, int(Status.FREE)),
+            "cost": np.zeros(loops),
+            "multipliers": np.zeros((loops, self.n_rows)),
+            "iterations": np.zeros(loops, dtype=int),
+            "shift": np.full(loops, 0 if self.n_z else -1),
+        }
+        return Move(u, **{**plain, **parts})
+
     def start(
         self,
         y0: Array | None = None,

@@ -46,21 +46,9 @@ class StateFeedback(Controller):
         before = self.last_input(memory.vector)
         wanted = memory.vector @ on_memory.T
         u = self.clip(wanted, before)
-        loops = len(u)
         cut = np.abs(u - wanted).max(axis=-1) > 1e-9
         status = np.where(cut, Status.CLIPPED, Status.FREE)
-        return Move(
-            u=u,
-            w=r[:, 0].copy(),
-            governed=r[:, 0].copy(),
-            decision=np.zeros((loops, 0)),
-            known=np.zeros((loops, 0)),
-            status=status,
-            cost=np.zeros(loops),
-            multipliers=np.zeros((loops, 0)),
-            iterations=np.zeros(loops, dtype=int),
-            shift=np.full(loops, -1),
-        )
+        return self._move(u, r, status=status)
 
     def _missed(self, memory: Memory, u: Array, move: Move) -> Array:
         """Way from what the law asked for to the applied input, unless windup is on."""

@@ -266,19 +266,7 @@ class PredictiveController(Controller):
         theta = self._known(memory.vector, r, v)
         z = theta @ self.program.free.T
         kept = (self.program.room(z, theta) >= -self.program.slack).all(axis=-1)
-        loops = len(theta)
-        move = Move(
-            u=self.first_move.value(z, theta),
-            w=r[:, 0].copy(),
-            governed=r[:, 0].copy(),
-            decision=z,
-            known=theta,
-            status=np.full(loops, Status.FREE),
-            cost=np.zeros(loops),
-            multipliers=np.zeros((loops, self.n_rows)),
-            iterations=np.zeros(loops, dtype=int),
-            shift=np.zeros(loops, dtype=int),
-        )
+        move = self._move(self.first_move.value(z, theta), r, decision=z, known=theta)
         for i in np.flatnonzero(~kept).tolist():
             self._decide_limited(move, memory, i)
         return self._finish(move, memory)

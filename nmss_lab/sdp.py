@@ -147,18 +147,7 @@ class StateDependentFeedback(Controller):
         u = self.clip(wanted, before)
         cut = np.abs(u - wanted).max(axis=-1) > 1e-9
         status[cut & (status == Status.FREE)] = Status.CLIPPED
-        return Move(
-            u=u,
-            w=r[:, 0].copy(),
-            governed=r[:, 0].copy(),
-            decision=np.zeros((loops, 0)),
-            known=gains.reshape(loops, -1),
-            status=status,
-            cost=np.zeros(loops),
-            multipliers=np.zeros((loops, 0)),
-            iterations=np.zeros(loops, dtype=int),
-            shift=np.full(loops, -1),
-        )
+        return self._move(u, r, status=status, known=gains.reshape(loops, -1))
 
     def _followed(self, memory: Memory, u: Array, move: Move) -> Array:
         if not self.anti_windup:
@@ -367,19 +356,9 @@ class StateDependentGovernor(PredictiveController):
         raise ValueError(NOT_LINEAR)
 
     def _decide(self, memory: Memory, r: Array, v: Array) -> Move:
-        loops, n_u = len(memory.vector), self.model.n_u
-        move = Move(
-            u=np.zeros((loops, n_u)),
-            w=r[:, 0].copy(),
-            governed=r[:, self.governs_ahead].copy(),
-            decision=np.zeros((loops, self.n_z)),
-            known=np.zeros((loops, self.n_theta)),
-            status=np.full(loops, int(Status.FREE)),
-            cost=np.zeros(loops),
-            multipliers=np.zeros((loops, self.n_rows)),
-            iterations=np.zeros(loops, dtype=int),
-            shift=np.zeros(loops, dtype=int),
-        )
+        loops = len(memory.vector)
+        ahead = r[:, self.governs_ahead].copy()
+        move = self._move(np.zeros((loops, self.model.n_u)), r, governed=ahead)
         for i in range(loops):
             self._decide_one(move, memory, r[i], i)
         move.u[:] = self.clip(move.u, self.last_input(memory.vector))

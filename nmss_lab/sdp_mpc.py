@@ -677,20 +677,8 @@ class StateDependentController(PredictiveController):
 
     def _decide(self, memory: Memory, r: Array, v: Array) -> Move:
         known = self._base(memory, r, v)
-        loops, n_u = len(known), self.model.n_u
-        move = Move(
-            u=np.zeros((loops, n_u)),
-            w=r[:, 0].copy(),
-            governed=r[:, 0].copy(),
-            decision=np.zeros((loops, self.n_z)),
-            known=known,
-            status=np.full(loops, Status.FREE),
-            cost=np.zeros(loops),
-            multipliers=np.zeros((loops, self.n_rows)),
-            iterations=np.zeros(loops, dtype=int),
-            shift=np.zeros(loops, dtype=int),
-        )
-        for i in range(loops):
+        move = self._move(np.zeros((len(known), self.model.n_u)), r, known=known)
+        for i in range(len(known)):
             self._decide_one(move, memory, i)
         return self._clipped(move, memory)
 

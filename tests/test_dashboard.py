@@ -107,7 +107,11 @@ def test_python_shown_computes_what_is_shown(
     kind: type[Choices], given: dict[str, Any]
 ) -> None:
     """The script of a page runs, and its runs and measures are those of the page."""
-    choices = kind(**given)
+    script_computes_what_is_shown(kind(**given))
+
+
+def script_computes_what_is_shown(choices: Choices) -> None:
+    """Run the script of a page; compare runs and printed measures with the page's."""
     names: dict[str, Any] = {}
     printed = io.StringIO()
     with contextlib.redirect_stdout(printed):

@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-import contextlib
-import io
 from typing import Any
 
 import numpy as np
 import pytest
-from conftest import REPLAY, Open, settled, slide
+from conftest import Open, settled, slide
 from playwright.sync_api import expect
-from test_dashboard import anything, sliders
+from test_dashboard import anything, script_computes_what_is_shown, sliders
 
 from apps.pages import state_dependent
 from apps.pages.live import LivePage
 from apps.varying import OWN, VaryingChoices
 from nmss_lab.cases import VARYING_CASES
 from nmss_lab.controller import Status
-from nmss_lab.measures import table
 from nmss_lab.plots import draw, pack, varying_charts
 
 PAGE = "state_dependent"
@@ -75,18 +72,7 @@ def test_every_case_opens(case: str) -> None:
 )
 def test_python_shown_computes_what_is_shown(given: dict[str, Any]) -> None:
     """The script of the page runs, and its runs and measures are those of the page."""
-    choices = VaryingChoices(**given)
-    names: dict[str, Any] = {}
-    printed = io.StringIO()
-    with contextlib.redirect_stdout(printed):
-        exec(compile(choices.script(), "shown", "exec"), names)
-    runs = choices.runs()
-    assert list(names["runs"]) == list(runs)
-    for name, run in runs.items():
-        scale = np.abs(run.y).max()
-        assert np.abs(names["runs"][name].y - run.y).max() <= REPLAY * scale
-    rows = [str(row) for row in table(runs, choices.output)]
-    assert printed.getvalue().splitlines() == rows
+    script_computes_what_is_shown(VaryingChoices(**given))
 
 
 def test_samples_that_did_not_settle_are_crossed() -> None:
