@@ -312,6 +312,9 @@ def varying_charts(
     return [_flagged(c, flags) if c.name in FLAGGED else c for c in charts]
 
 
+LOW = "increment", "cost", "decrease", "passes"
+"""Charts that pages show with little height: few ticks."""
+
 FLAGGED = "output", "cost", "passes"
 """Charts in which samples that did not settle are crossed."""
 
@@ -1002,6 +1005,8 @@ class ChartFigure:
         self.figure.add_tools(hover)
         if chart.counts:
             self.figure.yaxis[0].ticker.min_interval = 1
+        if chart.name in LOW:
+            self.figure.yaxis[0].ticker.desired_num_ticks = 3
         self.show(chart)
 
     def show(self, chart: Chart) -> None:
