@@ -14,8 +14,8 @@ LOOK = {
     "overshoots, and the governor bends the reference instead.",
     "product_8_5_2": "Switch on past plans: frozen predictions are corrected sample by "
     "sample, settled ones lie on each other. Then look into sample 5, pass by pass.",
-    "conical_tank": "On the way down, where the tank becomes fast, iterated predictions "
-    "swing or creep: crosses mark samples that did not settle.",
+    "conical_tank": "On the way down, where the tank becomes fast, iterated "
+    "predictions swing or creep: crosses mark samples that did not settle.",
     "stirred_reactor": "The reactor is unstable. Frozen predictions lose it, iterated "
     "ones do not always settle, true derivatives hold it.",
     "own": "Your own equation: type coefficients that depend on past outputs and "
