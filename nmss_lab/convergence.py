@@ -18,13 +18,8 @@ import scipy.optimize
 from nmss_lab.controller import Status
 from nmss_lab.models import Array
 from nmss_lab.qp import solve
-from nmss_lab.sdp_mpc import (
-    Point,
-    Scheme,
-    Settling,
-    StateDependentController,
-    Trace,
-)
+from nmss_lab.sdp_mpc import Settling, StateDependentController, Trace
+from nmss_lab.sdp_problem import Point, Scheme
 from nmss_lab.simulate import Run
 
 TRUE: Scheme = "gauss-newton"

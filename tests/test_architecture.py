@@ -28,6 +28,7 @@ ORDER = [
     "mpc",
     "governor",
     "sdp",
+    "sdp_problem",
     "sdp_mpc",
     "analysis",
     "simulate",

@@ -27,7 +27,8 @@ from nmss_lab.reproduce.varying_pip import (
     frozen_product,
     model_of,
 )
-from nmss_lab.sdp_mpc import Problem, Settling, StateDependentController
+from nmss_lab.sdp_mpc import Settling, StateDependentController
+from nmss_lab.sdp_problem import Problem
 from nmss_lab.simulate import Run, Scenario
 
 # 8.3 and 8.4: predictive control
