@@ -232,7 +232,7 @@ class StateDependentController(PredictiveController):
         price = 4.0 * np.abs(solution.multipliers[self.problem.on_outputs]).max(
             initial=0.0
         )
-        most = self._most(each, price)
+        most = self._most(each, price, scheme)
         trials = []
         for _ in range(12):
             z = point.z + share * step
@@ -244,11 +244,11 @@ class StateDependentController(PredictiveController):
         finite = [trial for trial in trials if np.isfinite(trial.cost)]
         return finite[0] if finite else trials[-1]
 
-    def _most(self, each: Pass, price: float) -> float:
+    def _most(self, each: Pass, price: float, scheme: Scheme) -> float:
         """Largest merit that the next point may have."""
         point, merit = each.point, self.problem.merit(each.point, price)
         by_rank = each.status is Status.SOFTENED and self.limits.outputs != "soft"
-        if self.settling.scheme == "iterated" or by_rank:
+        if scheme == "iterated" or by_rank:
             return np.finfo(float).max  # anything that has not run away
         slope = point.program.H @ point.z + point.program.f @ point.theta
         step = each.solution.decision - point.z

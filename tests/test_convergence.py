@@ -323,3 +323,15 @@ def test_mistakes_are_named():
 def test_the_cycle_is_the_one_of_the_notes():
     """Horizon, weights and limits as written down."""
     assert CYCLE["horizon"] == Horizon(10, 6)
+
+
+def test_passes_shown_are_those_of_a_run_that_settles_so():
+    """Another way to settle, asked of one run's sample, takes the passes of its own."""
+    run = run_step(moves(Settling("iterated")), SHORT)
+    for settling in (Settling("gauss-newton"), Settling("iterated", damping=0.0)):
+        own = run_step(moves(settling), SHORT[:1])
+        other = run_step(moves(Settling("newton")), SHORT[:1])
+        shown = [iterates(each, 0, settling) for each in (own, other)]
+        assert len(shown[0]) == own.iterations[0]
+        assert [each.cost for each in shown[0]] == [each.cost for each in shown[1]]
+    assert len(iterates(run, 5)) == run.iterations[5]
