@@ -487,7 +487,8 @@ def test_a_long_search_is_cancelled(visit: Open) -> None:
     """A search of a long record shows progress, leaves the page alive, and stops."""
     page = visit()
     upload(page, text(table(60_000)), "long.csv")
-    expect(page.locator("select[name=time]")).to_have_count(1)
+    # two megabytes travel and are read: more than the usual five seconds under load
+    expect(page.locator("select[name=time]")).to_have_count(1, timeout=30_000)
     for name in ("na_high", "nb_high"):
         slide = page.locator(f"input[name={name}]")
         slide.fill("6")
