@@ -431,11 +431,7 @@ class Controller(ABC):
         """
         layout = self.form.recipe.layout
         single = memory.vector.ndim == 1
-        many = (
-            Memory(*(np.asarray(part)[None] for part in _parts(memory)))
-            if single
-            else memory
-        )
+        many = as_ensemble(memory) if single else memory
         r_now = layout.read(many.vector, "r")
         v_now = layout.read(many.vector, "v")[:, 0]
         r_all = _ahead("r", r, r_now, 1 + self.preview)
@@ -588,6 +584,11 @@ def _ahead(name: str, given: Array | None, now: Array, steps: int) -> Array:
     if not np.isfinite(values).all():
         raise ValueError(f"{name} is not finite at every step of the horizon")
     return np.broadcast_to(values[..., :steps, :], (loops, steps, channels))
+
+
+def as_ensemble(memory: Memory) -> Memory:
+    """Memory of one loop with a leading axis, as an ensemble of one."""
+    return Memory(*(np.asarray(part)[None] for part in _parts(memory)))
 
 
 def _parts(record: Memory | Move) -> list[Array]:

@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 import scipy.linalg
 
-from nmss_lab.controller import Limits, Memory, Move, Status
+from nmss_lab.controller import Limits, Memory, Move, Status, as_ensemble
 from nmss_lab.models import Array
 from nmss_lab.mpc import Reading, Setup, Terminal
 from nmss_lab.nmss import Form, Layout, integral_of_error_form, past_form
@@ -450,7 +450,7 @@ class StateDependentController(PredictiveController):
     def _balanced(self, vector: Array, y: Array, u: Array) -> Array:
         layout, r = self._plan_layout, np.tile(y, (1, 1 + self.preview, 1))
         for _ in range(30):
-            memory = Memory(*(np.asarray(p)[None] for p in _parts(self._fresh(vector))))
+            memory = as_ensemble(self._fresh(vector))
             move = self._decide(memory, r, np.zeros((1, 1, 0)))
             missed = u - layout.read(move.known[0], "free_u")
             if np.abs(missed).max() < 1e-10 * (1.0 + np.abs(u).max()):
@@ -744,7 +744,3 @@ def _knowledge(setup: Setup, integral: bool) -> Knowledge:
         np.pad(base.from_r, room),
         np.pad(base.from_v, room),
     )
-
-
-def _parts(record: Memory) -> list[Array]:
-    return [getattr(record, part.name) for part in dataclasses.fields(record)]
