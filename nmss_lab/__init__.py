@@ -15,7 +15,9 @@ from nmss_lab.controller import Controller, Limits, Memory, Move, Status
 from nmss_lab.convergence import Examination, examine
 from nmss_lab.design import Design
 from nmss_lab.governor import governor
+from nmss_lab.matching import Match, match
 from nmss_lab.models import DifferenceModel, LinearPlant, Plant
+from nmss_lab.montecarlo import MonteCarlo, monte_carlo, monte_carlo_parts
 from nmss_lab.mpc import (
     STRUCTURES,
     disturbance_augmented,
@@ -41,6 +43,17 @@ from nmss_lab.simulate import (
     samples,
 )
 from nmss_lab.state_dependent import StateDependentModel
+from nmss_lab.tuning import Distance, Goal, Trial, Tuned, pareto, tune
+from nmss_lab.uncertainty import (
+    EstimatedModels,
+    Intervals,
+    ParameterCovariance,
+    RelativeRanges,
+    Sampler,
+    realisation,
+    uncertainty_bounds,
+)
+from nmss_lab.weights import Weights
 
 __all__ = [
     "CASES",
@@ -50,23 +63,35 @@ __all__ = [
     "Controller",
     "Design",
     "DifferenceModel",
+    "Distance",
+    "EstimatedModels",
     "Examination",
+    "Goal",
     "Horizon",
+    "Intervals",
     "Limits",
     "LinearLoop",
     "LinearPlant",
+    "Match",
     "Memory",
+    "MonteCarlo",
     "Move",
+    "ParameterCovariance",
     "Plant",
     "PredictiveController",
     "Record",
+    "RelativeRanges",
     "Review",
     "Run",
+    "Sampler",
     "Scenario",
     "Settling",
     "StateDependentModel",
     "Status",
     "TransferFunction",
+    "Trial",
+    "Tuned",
+    "Weights",
     "__version__",
     "case",
     "closed_loop",
@@ -82,9 +107,14 @@ __all__ = [
     "linear_loop",
     "lq_gain",
     "many_loops",
+    "match",
     "minimal",
+    "monte_carlo",
+    "monte_carlo_parts",
+    "pareto",
     "pip",
     "pole_gain",
+    "realisation",
     "review",
     "samples",
     "sdp_governor",
@@ -92,6 +122,8 @@ __all__ = [
     "sdp_integral_of_error",
     "sdp_pip",
     "state_weight",
+    "tune",
+    "uncertainty_bounds",
     "wang_young",
 ]
 

@@ -8,7 +8,7 @@ otherwise.
 from __future__ import annotations
 
 import dataclasses
-import itertools
+import functools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -25,6 +25,7 @@ from nmss_lab.predict import Horizon
 from nmss_lab.sdp_mpc import Settling
 from nmss_lab.simulate import Scenario
 from nmss_lab.state_dependent import StateDependentModel, StateDependentPlant
+from nmss_lab.uncertainty import Intervals
 
 
 @dataclass(frozen=True, eq=False)
@@ -255,11 +256,22 @@ STRESS_LEVELS: dict[int, dict[str, float]] = {
 """Largest deviations of the IFAC'93 plant's parameters, Table 4.1."""
 
 
-def stress_corners(level: int) -> list[ContinuousPlant]:
-    """Extremes of a stress level of the IFAC'93 plant (Table 4.1), 32 plants.
+def stress(
+    level: int, corners: bool = False, dt: float = 0.5, substeps: int = 1
+) -> Intervals:
+    """Parameters of the IFAC'93 plant within a stress level (Table 4.1).
 
-    They come in the order of ``itertools.product((-1, 1), repeat=5)`` on T1, T2, w0,
-    zeta, K.  Level 1 leaves K alone, so that its plants come in pairs.
+    The corners, 32, come in the order of ``itertools.product`` on T1, T2, w0, zeta, K,
+    the low side first.  Level 1 leaves K alone, so that its plants come in pairs.
+
+    Parameters
+    ----------
+    level : int
+        1, 2 or 3.
+    corners : bool
+        Whether to take the corners instead of uniform draws.
+    dt, substeps : float, int
+        Sampling of the plants, see ``ContinuousPlant.sampled``.
 
     Raises
     ------
@@ -269,16 +281,16 @@ def stress_corners(level: int) -> list[ContinuousPlant]:
     if level not in STRESS_LEVELS:
         raise ValueError(f"level = {level}: expected 1, 2 or 3")
     nominal = {"T1": 5.0, "T2": 0.4, "w0": 5.0, "zeta": 0.3, "K": 1.0}
-    deviation = STRESS_LEVELS[level]
-    return [
-        ifac93_plant(
-            **{
-                name: value + sign * deviation[name]
-                for sign, (name, value) in zip(signs, nominal.items(), strict=True)
-            }
-        )
-        for signs in itertools.product((-1, 1), repeat=5)
-    ]
+    around = {
+        name: (value - STRESS_LEVELS[level][name], value + STRESS_LEVELS[level][name])
+        for name, value in nominal.items()
+    }
+    build = functools.partial(_sampled_ifac93, dt, substeps)
+    return Intervals(build, around, corners)
+
+
+def _sampled_ifac93(dt: float, substeps: int, **parameters: float) -> LinearPlant:
+    return ifac93_plant(**parameters).sampled(dt, substeps)
 
 
 def square_wave(samples: int, half_period: int) -> Array:

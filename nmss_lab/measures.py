@@ -171,14 +171,15 @@ def table(runs: Mapping[str, Run], channel: int = 0) -> list[dict[str, str | flo
 
     Times are in seconds, overshoot in per cent; nan where a step has no such time.
     """
-    return [_row(name, measures(run, channel)) for name, run in runs.items()]
+    return [{"run": name, **summary(run, channel)} for name, run in runs.items()]
 
 
-def _row(name: str, found: Measures) -> dict[str, str | float]:
+def summary(run: Run, channel: int = 0) -> dict[str, float]:
+    """Row of ``table`` for one run, without its name."""
+    found = measures(run, channel)
     first = found.steps[0] if found.steps else None
     broken = sum(part.samples for part in found.violations.values())
     return {
-        "run": name,
         "rise": first.rise if first else np.nan,
         "settling": first.settling if first else np.nan,
         "overshoot": 100.0 * first.overshoot if first else np.nan,

@@ -17,9 +17,11 @@ from nmss_lab import cases, reproduce
 from nmss_lab.analysis import linear_loop
 from nmss_lab.design import Design
 from nmss_lab.measures import steps
+from nmss_lab.models import LinearPlant
 from nmss_lab.predict import Horizon
 from nmss_lab.reproduce import chapter_5, poles
 from nmss_lab.simulate import Run, Scenario, closed_loop, closed_loops
+from nmss_lab.uncertainty import realisations
 
 GOLDEN = Path(__file__).parent / "golden"
 
@@ -28,6 +30,12 @@ SAME = DECISION
 
 READINGS = {"False": "held", "next": "next", "True": "preview", "zero": "zero"}
 """How the golden file names the readings of the reference."""
+
+
+def corners(level: int, substeps: int = 1) -> list[LinearPlant]:
+    """Return the 32 corners of a stress level, sampled."""
+    chosen = cases.stress(level, corners=True, substeps=substeps)
+    return [corner.plant for corner in realisations(chosen)]
 
 
 def golden(name: str) -> dict[str, Any]:
@@ -173,7 +181,7 @@ def test_ifac93_corners(
     controller = dataclasses.replace(
         case.designs[name], structure=structure, Q=Q, reference=reading
     ).build()
-    plants = [p.sampled(0.5, substeps=20) for p in cases.stress_corners(level)]
+    plants = corners(level, 20)
     times = len(plants) // found["n"]
     runs = closed_loops(plants, controller, case.scenario)
     peaks = np.array([np.abs(run.y_fine).max() for run in runs])
@@ -314,7 +322,7 @@ def test_figures_6_6_and_6_7(
     found = chapters_6_7["fig66_67"]["counts"][key]
     chosen = cases.case("ifac93_6_3_3").designs[design]
     controller = dataclasses.replace(chosen, reference=reading).build()
-    plants = [p.sampled(0.5, substeps=20) for p in cases.stress_corners(2)]
+    plants = corners(2, 20)
     runs = closed_loops(plants, controller, Scenario(cases.square_wave(180, 20)))
     radii = [linear_loop(controller, plant).radius for plant in plants]
     assert sum(radius >= 1.0 for radius in radii) == found["nunst"]
@@ -334,7 +342,7 @@ def test_radii_of_the_corners(chapters_6_7: dict[str, Any], form: str) -> None:
     case = cases.case("ifac93_6_3_3")
     structure = {"fb": "wang_young", "fp": "forward_path"}[form]
     controller = case.designs[structure].build()
-    plants = [plant.sampled(0.5) for plant in cases.stress_corners(2)]
+    plants = corners(2)
     radii = [linear_loop(controller, plant).radius for plant in plants]
     assert radii == pytest.approx(found, abs=SAME)
 

@@ -15,6 +15,7 @@ from nmss_lab.models import Array, LinearPlant, Plant
 from nmss_lab.predict import Horizon
 from nmss_lab.predictive import PredictiveController
 from nmss_lab.simulate import Equation, Run, Scenario, closed_loop, closed_loops
+from nmss_lab.uncertainty import realisations
 
 
 def simulated(design: Design, plant: Plant | Equation, scenario: Scenario) -> Run:
@@ -73,7 +74,7 @@ def value_at(polynomial: Array, z: complex) -> Array:
 @functools.cache
 def corners() -> list[LinearPlant]:
     """Plants of stress level 2, with outputs every 25 ms."""
-    return [plant.sampled(0.5, substeps=20) for plant in cases.stress_corners(2)]
+    return [d.plant for d in realisations(cases.stress(2, corners=True, substeps=20))]
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,149 @@
+"""One way to spread independent tasks: here, over processes, or over a cluster.
+
+Whatever takes long takes ``executor``: none (in this process), a
+``concurrent.futures.ProcessPoolExecutor``, or a Dask cluster's, such as
+``Client("tcp://...").get_executor()``.  A task carries all that it needs, seeds
+included, so its numbers do not depend on where it runs.
+"""
+
+from __future__ import annotations
+
+import logging
+import multiprocessing
+import os
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import (
+    BrokenExecutor,
+    Executor,
+    Future,
+    ProcessPoolExecutor,
+    as_completed,
+)
+from contextlib import contextmanager
+from typing import TypeVar
+
+Task = TypeVar("Task")
+Result = TypeVar("Result")
+
+LOG = logging.getLogger(__name__)
+
+
+def each(
+    function: Callable[[Task], Result],
+    tasks: Iterable[Task],
+    executor: Executor | None = None,
+) -> Iterator[tuple[int, Result]]:
+    """Apply a function to every task and yield results as they are done.
+
+    A process that is killed loses nothing: a pool that breaks is given up and what it
+    still owed is computed here; a cluster hands such tasks to its other workers.
+    Closing the generator withdraws the tasks that have not begun.
+
+    Parameters
+    ----------
+    function : callable
+        Of one task; with an executor, function and tasks must be picklable.
+    tasks : iterable
+    executor : concurrent.futures.Executor, optional
+
+    Yields
+    ------
+    pair (int, result)
+        Number of the task, and what the function returned; in no given order with an
+        executor.
+
+    Raises
+    ------
+    Exception
+        Whatever the function raises.
+    """
+    tasks = list(tasks)
+    if executor is None:
+        yield from ((i, function(task)) for i, task in enumerate(tasks))
+        return
+    futures: dict[Future[Result], int] = {}
+    owed = set(range(len(tasks)))
+    try:
+        for i, task in enumerate(tasks):
+            futures[executor.submit(function, task)] = i
+        for future in as_completed(futures):
+            result = future.result()
+            owed.remove(futures[future])
+            yield futures[future], result
+    except BrokenExecutor as error:
+        LOG.warning("The pool of workers broke (%s); going on in one process.", error)
+        yield from ((i, function(tasks[i])) for i in sorted(owed))
+    finally:
+        for future in futures:
+            future.cancel()
+
+
+def in_order(
+    function: Callable[[Task], Result],
+    tasks: Iterable[Task],
+    executor: Executor | None = None,
+) -> Iterator[Result]:
+    """Results of ``each`` in the order of the tasks, as soon as they can be."""
+    waiting: dict[int, Result] = {}
+    due = 0
+    for i, result in each(function, tasks, executor):
+        waiting[i] = result
+        while due in waiting:
+            yield waiting.pop(due)
+            due += 1
+
+
+def all_of(
+    function: Callable[[Task], Result],
+    tasks: Sequence[Task],
+    executor: Executor | None = None,
+) -> list[Result]:
+    """Results of ``each`` as a list, in the order of the tasks."""
+    return list(in_order(function, tasks, executor))
+
+
+@contextmanager
+def executor_for(workers: int = 1, cluster: str = "") -> Iterator[Executor | None]:
+    """Open an executor for a number of processes or for a Dask cluster.
+
+    Parameters
+    ----------
+    workers : int
+        Processes on this machine; with 1 no executor is opened.
+    cluster : str
+        Address of a Dask scheduler, such as "tcp://host:8786".
+
+    Raises
+    ------
+    ValueError
+        If ``workers`` is not positive, or Dask is not installed.
+    OSError
+        If no scheduler answers at that address.
+    """
+    if workers < 1:
+        raise ValueError(f"workers = {workers}: expected at least 1")
+    if cluster:
+        with _dask_executor(cluster) as executor:
+            yield executor
+        return
+    if workers == 1:
+        yield None
+        return
+    # Processes side by side gain nothing from threads inside BLAS, and new ones,
+    # not copies of this one, cannot inherit a lock that one of its threads holds.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    fresh = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(workers, mp_context=fresh) as pool:
+        yield pool
+
+
+@contextmanager
+def _dask_executor(address: str) -> Iterator[Executor]:
+    try:
+        from distributed import Client
+    except ImportError as error:
+        raise ValueError(
+            "a cluster needs Dask: pip install 'nmss-lab[cluster]'"
+        ) from error
+    with Client(address, timeout="10s") as client:  # type: ignore[no-untyped-call]
+        yield client.get_executor()
