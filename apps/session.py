@@ -11,7 +11,7 @@ import hashlib
 import math
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import param
@@ -45,24 +45,62 @@ def _worked_case(name: str) -> Case:
 
 
 def known_case(name: str) -> Case:
-    """Build a case once; cases are immutable.  Kept models are cases as well."""
+    """Build a case once; cases are immutable.  Kept ones are cases as well."""
     return KEPT[name] if name in KEPT else _worked_case(name)
 
 
 KEPT: dict[str, Case] = {}
-"""Cases of models that were identified here, by name, the latest last."""
+"""Cases that pages made and sent to others, by name, the latest last."""
+
+ORIGINS: dict[str, Origin] = {}
+"""Python that makes each of them."""
 
 MOST_KEPT = 200
+
+GONE = {
+    "model": "its model is no longer kept",
+    "tuned": "its tuned design is no longer kept",
+    "drawn": "its plant is no longer kept",
+}
+"""What a kept case is about, by the beginning of its name."""
+
+
+class Origin(NamedTuple):
+    """Python of a kept case: what it imports, and lines that make ``example``."""
+
+    imports: tuple[str, ...]
+    lines: tuple[str, ...]
+
+
+def keep_case(kind: str, content: str, example: Case, origin: Origin) -> str:
+    """Keep a case for the other pages; return its name, the same for equal content.
+
+    ``kind`` is a key of ``GONE``.
+    """
+    name = f"{kind}-{hashlib.sha256(content.encode()).hexdigest()[:12]}"
+    KEPT.setdefault(name, replace(example, name=name))
+    ORIGINS[name] = origin
+    while len(KEPT) > MOST_KEPT:
+        oldest = next(iter(KEPT))
+        del KEPT[oldest], ORIGINS[oldest]
+    return name
 
 
 def keep_model(estimate: Estimate) -> str:
     """Keep an identified model for the other pages; return the name of its case."""
-    text = dumps(estimate)
-    name = f"model-{hashlib.sha256(text.encode()).hexdigest()[:12]}"
-    KEPT.setdefault(name, model_case(estimate.to_model(), estimate.covariance, name))
-    while len(KEPT) > MOST_KEPT:
-        del KEPT[next(iter(KEPT))]
-    return name
+    example = model_case(estimate.to_model(), estimate.covariance, "model")
+    origin = Origin(
+        (
+            "from nmss_lab.cases import model_case",
+            "from nmss_lab.files import load",
+        ),
+        (
+            "# model.json: saved on the page Identify",
+            'found = load("model.json")',
+            "example = model_case(found.to_model(), found.covariance)",
+        ),
+    )
+    return keep_case("model", dumps(estimate), example, origin)
 
 
 def plain(name: str) -> str:
@@ -334,8 +372,9 @@ class Choices(Form):
         if name in KEPT and name not in known:
             self.param["case"].objects = [*known, name]
         elif name not in known:
-            gone = "; its model is no longer kept" if name.startswith("model-") else ""
-            raise ValueError(f"case = {name!r}: there is no such case here{gone}")
+            gone = GONE.get(str(name).partition("-")[0])
+            why = f"; {gone}" if gone and "-" in str(name) else ""
+            raise ValueError(f"case = {name!r}: there is no such case here{why}")
 
     def defaults(self) -> dict[str, Any]:
         """All choices as they are when the case is chosen."""
@@ -464,7 +503,7 @@ class Choices(Form):
     def script(self) -> str:
         """Python that computes what the page shows and prints its measures."""
         lines = [
-            *(_KEPT_IMPORTS if self.case in KEPT else _SCRIPT_IMPORTS),
+            *self._imports(),
             "",
             *self._case_lines(),
             *self._plant_lines(),
@@ -477,14 +516,18 @@ class Choices(Form):
         ]
         return "\n".join(lines) + "\n"
 
+    def _imports(self) -> list[str]:
+        if self.case not in KEPT:
+            return list(_SCRIPT_IMPORTS)
+        own = [line for line in _SCRIPT_IMPORTS if "nmss_lab.cases" not in line]
+        more = "from nmss_lab.cases import piecewise", *ORIGINS[self.case].imports
+        start = own.index("from nmss_lab.measures import table")
+        return own[:start] + sorted({*own[start:], *more})
+
     def _case_lines(self) -> list[str]:
         if self.case not in KEPT:
             return [f'example = case("{self.case}")']
-        return [
-            "# model.json: saved on the page Identify",
-            'found = load("model.json")',
-            "example = model_case(found.to_model(), found.covariance)",
-        ]
+        return list(ORIGINS[self.case].lines)
 
     def _plant_lines(self) -> list[str]:
         lines = ["plant = example.plant"]
@@ -814,13 +857,6 @@ _SCRIPT_IMPORTS = (
     "from nmss_lab.measures import table",
     "from nmss_lab.predict import Horizon",
     "from nmss_lab.simulate import closed_loop",
-)
-
-
-_KEPT_IMPORTS = tuple(
-    line.replace("import case,", "import model_case,")
-    + ("\nfrom nmss_lab.files import load" if "nmss_lab.cases" in line else "")
-    for line in _SCRIPT_IMPORTS
 )
 
 
