@@ -147,11 +147,16 @@ def linear_loop(
     Raises
     ------
     ValueError
-        If the plant's size differs from the model's.
+        If the plant is not linear, or its size differs from the model's.
     """
     model = controller.model
     plant = model if plant is None else plant
     plant = plant.plant() if isinstance(plant, DifferenceModel) else plant
+    if not isinstance(plant, LinearPlant):
+        raise ValueError(
+            f"plant is a {type(plant).__name__}, expected a LinearPlant or "
+            "DifferenceModel: only a linear loop has poles"
+        )
     if (plant.n_y, plant.n_u) != (model.n_y, model.n_u):
         raise ValueError(
             f"the plant has {plant.n_y} outputs and {plant.n_u} inputs, the "

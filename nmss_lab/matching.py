@@ -8,8 +8,9 @@ while none of them is near.
 from __future__ import annotations
 
 import dataclasses
+from concurrent.futures import Executor
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.optimize
@@ -18,6 +19,7 @@ from nmss_lab.analysis import ControlPolynomials, control_polynomials, linear_lo
 from nmss_lab.design import Design
 from nmss_lab.models import Array, DifferenceModel
 from nmss_lab.nmss import integral_of_error_form
+from nmss_lab.parallel import in_order
 from nmss_lab.pip import gain, pip
 from nmss_lab.predictive import PredictiveController
 from nmss_lab.qp import weight
@@ -54,7 +56,12 @@ class Match:
 
 
 def match(
-    K: Any, design: Design, starts: int = 3, seed: int = 0, evaluations: int = 20_000
+    K: Any,
+    design: Design,
+    starts: int = 3,
+    seed: int = 0,
+    evaluations: int = 20_000,
+    executor: Executor | None = None,
 ) -> Match:
     """Find weights for which a design's law without limits is u_k = -K x_k.
 
@@ -73,10 +80,12 @@ def match(
         and reading of the reference that are wanted; its weights do not matter, only
         that they can be built.  An "integral_of_error" design follows references as
         PIP does when ``reference="zero"``.
-    starts : int
-    seed : int
+    starts, seed : int
+        Starts besides the design's own weights are drawn around them.
     evaluations : int
         Designs to try at most from each start.
+    executor : concurrent.futures.Executor, optional
+        Where the starts are searched from, see ``nmss_lab.parallel``.
 
     Raises
     ------
@@ -93,45 +102,66 @@ def match(
     K = gain("K", K, form)
     wanted = _coefficients(_polynomials_of_gain(K, model))
     size = float(np.linalg.norm(wanted)) or 1.0
-    space = _Space(design)
-
-    def missed(vector: Array) -> Array:
-        try:
-            controller = space.design(vector).build()
-        except (ValueError, np.linalg.LinAlgError):
-            return np.full(wanted.size, 1e3)
-        assert isinstance(controller, PredictiveController)
-        found = _coefficients(control_polynomials(controller))
-        difference: Array = (found - wanted) / size
-        return difference
-
-    rng = np.random.default_rng(seed)
-    results = []
-    for i in range(starts):
-        first = space.start + (rng.standard_normal(space.count) if i else 0.0)
-        results.append(
-            scipy.optimize.least_squares(
-                missed,
-                first,
-                x_scale="jac",
-                xtol=1e-14,
-                ftol=1e-14,
-                gtol=1e-14,
-                max_nfev=max(evaluations // (space.count + 1), 1),
-            )
-        )
-        if np.linalg.norm(results[-1].fun) <= EXACT:
+    space, rng = _Space(design), np.random.default_rng(seed)
+    jumps = rng.standard_normal((starts, space.count))
+    jumps[0] = 0.0
+    passes = max(evaluations // (space.count + 1), 1)
+    tasks = [_Task(space, wanted / size, size, jump, passes) for jump in jumps]
+    results: list[_Result] = []
+    for result in in_order(_search, tasks, executor):
+        results.append(result)
+        if result.distance <= EXACT:
             break
-    best = min(results, key=lambda result: float(result.cost))
-    found = space.design(best.x)
+    best = min(results, key=lambda result: result.distance)
+    found = space.design(best.vector)
     forgotten = np.linalg.svd(form.A)[2][np.linalg.matrix_rank(form.A) :]
     return Match(
         found,
-        float(np.linalg.norm(best.fun)),
+        best.distance,
         linear_loop(found.build()).poles,
         linear_loop(pip(model, K)).poles,
         float(np.linalg.norm(K @ forgotten.T) / np.linalg.norm(K)),
     )
+
+
+class _Task(NamedTuple):
+    """One start of the search, on any machine."""
+
+    space: _Space
+    wanted: Array
+    size: float
+    jump: Array
+    passes: int
+
+
+class _Result(NamedTuple):
+    vector: Array
+    distance: float
+
+
+def _search(task: _Task) -> _Result:
+    """Least squares over the coefficients of the law, relative to the wanted ones."""
+
+    def missed(vector: Array) -> Array:
+        try:
+            controller = task.space.design(vector).build()
+        except (ValueError, np.linalg.LinAlgError):
+            return np.full(task.wanted.size, 1e3)
+        assert isinstance(controller, PredictiveController)
+        found = _coefficients(control_polynomials(controller))
+        difference: Array = found / task.size - task.wanted
+        return difference
+
+    result = scipy.optimize.least_squares(
+        missed,
+        task.space.start + task.jump,
+        x_scale="jac",
+        xtol=1e-14,
+        ftol=1e-14,
+        gtol=1e-14,
+        max_nfev=task.passes,
+    )
+    return _Result(result.x, float(np.linalg.norm(result.fun)))
 
 
 def _polynomials_of_gain(K: Array, model: DifferenceModel) -> ControlPolynomials:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import logging
 import multiprocessing
 import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import (
     BrokenExecutor,
     Executor,
@@ -19,7 +19,7 @@ from concurrent.futures import (
     ProcessPoolExecutor,
     as_completed,
 )
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from typing import TypeVar
 
 Task = TypeVar("Task")
@@ -32,7 +32,7 @@ def each(
     function: Callable[[Task], Result],
     tasks: Iterable[Task],
     executor: Executor | None = None,
-) -> Iterator[tuple[int, Result]]:
+) -> Generator[tuple[int, Result], None, None]:
     """Apply a function to every task and yield results as they are done.
 
     A process that is killed loses nothing: a pool that breaks is given up and what it
@@ -82,15 +82,16 @@ def in_order(
     function: Callable[[Task], Result],
     tasks: Iterable[Task],
     executor: Executor | None = None,
-) -> Iterator[Result]:
-    """Results of ``each`` in the order of the tasks, as soon as they can be."""
+) -> Generator[Result, None, None]:
+    """Yield results of ``each`` in the order of the tasks, as soon as they can be."""
     waiting: dict[int, Result] = {}
     due = 0
-    for i, result in each(function, tasks, executor):
-        waiting[i] = result
-        while due in waiting:
-            yield waiting.pop(due)
-            due += 1
+    with closing(each(function, tasks, executor)) as done:
+        for i, result in done:
+            waiting[i] = result
+            while due in waiting:
+                yield waiting.pop(due)
+                due += 1
 
 
 def all_of(

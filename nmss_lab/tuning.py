@@ -438,16 +438,17 @@ def tune(
     stopped = search.run(given)
     best = search.best
     tuned, values, factor = weights.apply(best.vector), best.values, best.attainment
+    found = weights.matrices(best.vector)
     own = attained(goals, before)
     if own <= factor:  # the start itself is the best, such as one no vector can say
-        tuned, values, factor = design, before, own
+        tuned, values, factor, found = design, before, own, dict(weights.own)
     return Tuned(
         tuned,
         factor,
         goals,
         before,
         values,
-        weights.matrices(best.vector),
+        found,
         tuple(search.history),
         search.count,
         stopped,

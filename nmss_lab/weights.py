@@ -158,7 +158,7 @@ class Weights:
     @cached_property
     def start(self) -> Array:
         """Vector of the design's own weights, or of the nearest admissible ones."""
-        own = self._own
+        own = self.own
         return np.concatenate([b.vector(own[b.name]) for b in self.blocks])
 
     def bounds(self, low: float, high: float) -> tuple[Array, Array]:
@@ -183,7 +183,7 @@ class Weights:
         moved = {
             b.name: b.matrix(part) for b, part in zip(self.blocks, parts, strict=True)
         }
-        return {**self._own, **moved}
+        return {**self.own, **moved}
 
     def apply(self, vector: Array) -> Design:
         """Design with the weights of a vector."""
@@ -223,8 +223,8 @@ class Weights:
         return np.stack([found[f"{name}[{i + 1}]"] for i in range(steps)])
 
     @cached_property
-    def _own(self) -> dict[str, Array]:
-        """Weights of the design by name, as far as the blocks can say."""
+    def own(self) -> dict[str, Array]:
+        """Weights of the design itself by name, as far as blocks can say."""
         design, model, horizon = self.design, self._model, self.design.horizon
         R = weight("R", design.R, horizon.Nc, model.n_u)
         n_x = model.n_y * (model.na + 1) + model.n_u * (model.nb - 1)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from contextlib import closing
 from dataclasses import dataclass, replace
@@ -14,6 +15,7 @@ import numpy as np
 from nmss_lab.identify.estimate import Estimate
 from nmss_lab.identify.fit import riv, sriv
 from nmss_lab.identify.structure import Noise, Orders, Start, inputs_of
+from nmss_lab.parallel import in_order
 from nmss_lab.records import Record
 
 if TYPE_CHECKING:
@@ -94,7 +96,8 @@ def order_search(
     """
     tries = structures(inputs_of(record).shape[1], na, nb, nk)
     done: list[Candidate] = []
-    with closing(_fitted(record, tries, noise, start, executor)) as fitted:
+    fit = functools.partial(_try, record, noise, start)
+    with closing(in_order(fit, tries, executor)) as fitted:
         for candidate in fitted:
             done.append(candidate)
             if progress is not None and progress(len(done), len(tries)):
@@ -140,7 +143,7 @@ def delay_profile(
     for delay in delays:
         nk = (*orders.nk[:channel], delay, *orders.nk[channel + 1 :])
         tried = replace(orders, nk=nk)
-        fitted = _try(estimate.record, tried, noise_or_none, estimate.start)
+        fitted = _try(estimate.record, noise_or_none, estimate.start, tried)
         if fitted.estimate is not None and fitted.estimate.is_good:
             found[delay] = fitted.estimate.aic
     if not found:
@@ -150,29 +153,8 @@ def delay_profile(
     return {k: w / sum(weight.values()) for k, w in weight.items()}
 
 
-def _fitted(
-    record: Record,
-    tries: list[Orders],
-    noise: Noise | None,
-    start: Start,
-    executor: Executor | None,
-) -> Generator[Candidate, None, None]:
-    """Candidates in the order of the tries; what was not begun is called off."""
-    if executor is None:
-        for orders in tries:
-            yield _try(record, orders, noise, start)
-        return
-    waiting = [executor.submit(_try, record, o, noise, start) for o in tries]
-    try:
-        for future in waiting:
-            yield future.result()
-    finally:
-        for future in waiting:
-            future.cancel()
-
-
 def _try(
-    record: Record, orders: Orders, noise: Noise | None, start: Start
+    record: Record, noise: Noise | None, start: Start, orders: Orders
 ) -> Candidate:
     try:
         found = (
