@@ -324,6 +324,10 @@ class Controller(ABC):
         }
         return Move(u, **{**plain, **parts})
 
+    def together(self) -> Controller:
+        """Return the controller that decides for an ensemble; this one by default."""
+        return self
+
     def start(
         self,
         y0: Array | None = None,
@@ -387,7 +391,7 @@ class Controller(ABC):
         ValueError
             If a size does not fit or r is not finite.
         """
-        recipe, layout, model = self.form.recipe, self.form.recipe.layout, self.model
+        layout, model = self.form.recipe.layout, self.model
         before = memory.vector
         y, r = _channels("y", y, model.n_y), _channels("r", r, model.n_y)
         if not np.isfinite(r).all():
@@ -398,12 +402,21 @@ class Controller(ABC):
         if not np.all(good):
             y = np.where(np.isfinite(y), y, self._expected(before))
             v = np.where(np.isfinite(v), v, layout.read(before, "v")[..., 0, :])
-        r = np.broadcast_to(r, y.shape)
-        now = np.concatenate(
-            [y, np.broadcast_to(v, (*y.shape[:-1], v.shape[-1])), r], -1
-        )
-        vector = before @ recipe.carry.T + now @ recipe.enter.T
+        parts = [before, *(_alike(part, before) for part in (y, v, r))]
+        vector = np.concatenate(parts, axis=-1) @ self._measuring.T
         return dataclasses.replace(memory, vector=vector, refused=~np.asarray(good))
+
+    @cached_property
+    def _measuring(self) -> Array:
+        """Memory after measuring from [memory; y_k; v_k; r_k]."""
+        recipe = self.form.recipe
+        return np.hstack([recipe.carry, recipe.enter])
+
+    @cached_property
+    def _applying(self) -> Array:
+        """Memory after applying from [memory; u_k; u seen; governed reference]."""
+        recipe = self.form.recipe
+        return np.hstack([recipe.keep, recipe.store])
 
     def _expected(self, vector: Array) -> Array:
         """y_k (..., n_y) that the model expects, from the memory before measuring."""
@@ -437,8 +450,8 @@ class Controller(ABC):
         r_all = _ahead("r", r, r_now, 1 + self.preview)
         v_all = _ahead("v", v, v_now, 1 + self.forecast_steps)
         move = self._decide(many, r_all, v_all)
-        told = np.where(many.refused, Status.REFUSED, Status.FREE)
-        np.maximum(move.status, told, out=move.status)
+        worse = many.refused & (move.status < Status.REFUSED)
+        move.status[worse] = Status.REFUSED
         return Move(*(part[0] for part in _parts(move))) if single else move
 
     def apply(
@@ -462,7 +475,7 @@ class Controller(ABC):
         ValueError
             If a size does not fit or an input is not finite.
         """
-        recipe, layout = self.form.recipe, self.form.recipe.layout
+        layout = self.form.recipe.layout
         u = _channels("u", u, self.model.n_u)
         seen = u if seen is None else _channels("seen", seen, self.model.n_u)
         if not (np.isfinite(u).all() and np.isfinite(seen).all()):
@@ -470,8 +483,8 @@ class Controller(ABC):
         vector = memory.vector
         if "integral" in layout:
             vector = self._followed(memory, u, move)
-        applied = np.concatenate([u, seen, move.governed], axis=-1)
-        vector = vector @ recipe.keep.T + applied @ recipe.store.T
+        applied = np.concatenate([vector, u, seen, move.governed], axis=-1)
+        vector = applied @ self._applying.T
         return Memory(
             vector,
             move.decision,
@@ -483,7 +496,8 @@ class Controller(ABC):
 
     def _followed(self, memory: Memory, u: Array, move: Move) -> Array:
         """Memory vector whose sum of the error fits the applied input."""
-        return self._tracked(memory.vector, self._missed(memory, u, move))
+        missed = self._missed(memory, u, move)
+        return self._tracked(memory.vector, missed) if missed.any() else memory.vector
 
     def _missed(self, memory: Memory, u: Array, move: Move) -> Array:
         """By how much the sum of the error must move the law, (..., n_u).
@@ -566,6 +580,13 @@ def _channels(name: str, value: Any, size: int) -> Array:
     if array.shape[-1:] != (size,):
         raise ValueError(f"{name} has shape {array.shape}, expected (..., {size})")
     return array
+
+
+def _alike(value: Array, memory: Array) -> Array:
+    """Signals (n,) or (loops, n) with the leading axes of a memory."""
+    if value.ndim == memory.ndim and len(value) == len(memory):
+        return value
+    return np.broadcast_to(value, (*memory.shape[:-1], value.shape[-1]))
 
 
 def _ahead(name: str, given: Array | None, now: Array, steps: int) -> Array:

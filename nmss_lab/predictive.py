@@ -6,6 +6,7 @@ does not solves the quadratic program; then the fallbacks, in order.
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -18,7 +19,8 @@ from nmss_lab.controller import Controller, Limits, Memory, Move, Status
 from nmss_lab.models import Array
 from nmss_lab.nmss import Layout
 from nmss_lab.predict import Affine, Horizon
-from nmss_lab.qp import Guess, Limit, QuadraticProgram, Solution, solve
+from nmss_lab.qp import Guess, Limit, QuadraticProgram, Solution, one_by_one, solve
+from nmss_lab.regions import Regions
 
 LOG = logging.getLogger(__name__)
 
@@ -66,7 +68,7 @@ class RankedProgram:
     ) -> tuple[Solution, Status]:
         """Solve with all rows; if that fails let rows give way as the limits say."""
         governed = (self.ranks == 0).any()
-        if self.limits.outputs == "soft" and self._soft.size:
+        if not self.strict:
             solution, status = self._solve_relaxed(theta, bounds)
             if solution.found or not governed:
                 return solution, status
@@ -76,6 +78,11 @@ class RankedProgram:
         if self.limits.outputs == "priority" or governed:
             return self._solve_by_rank(theta, bounds)
         return self._solve_without(theta, bounds)
+
+    @cached_property
+    def strict(self) -> bool:
+        """Whether the program is first solved as it is, without a price on rows."""
+        return self.limits.outputs != "soft" or not self._soft.size
 
     @cached_property
     def _giving(self) -> Array:
@@ -159,6 +166,8 @@ class PredictiveController(Controller):
     forecast : "held", "given" or a function, see ``Forecast``
     anti_windup : bool
         Whether a sum of the error stops growing while a level limit holds the input.
+    regions : Regions, optional
+        What loops in lock step have learnt from one another, see ``together``.
     """
 
     horizon: Horizon
@@ -169,6 +178,14 @@ class PredictiveController(Controller):
     backend: str = "daqp"
     forecast: Forecast = "held"
     anti_windup: bool = True
+    regions: Regions | None = None
+
+    def together(self) -> PredictiveController:
+        """Return this controller with a place to keep solutions for other loops.
+
+        Each call begins with none, so that an ensemble always gives the same numbers.
+        """
+        return dataclasses.replace(self, regions=Regions(self.program))
 
     @property
     def n_z(self) -> int:
@@ -242,12 +259,11 @@ class PredictiveController(Controller):
 
     def _missed(self, memory: Memory, u: Array, move: Move) -> Array:
         """As for any controller, by the law of the plan that was made now."""
-        made_now = np.asarray(move.shift == 0)[..., None]
-        free = np.where(
-            made_now,
-            move.known @ self.free_gain.T,
-            u - super()._missed(memory, u, move),
-        )
+        free = move.known @ self.free_gain.T
+        older = np.asarray(move.shift != 0)
+        if older.any():
+            others = u - super()._missed(memory, u, move)
+            free = np.where(older[..., None], others, free)
         return np.where(self._overruled(u, free, move), u - free, 0.0)
 
     def _overruled(self, u: Array, free: Array, move: Move) -> Array:
@@ -256,8 +272,8 @@ class PredictiveController(Controller):
         if not self.anti_windup:
             return other
         low, high = self.limits_u
-        held: Array = ((free > high) & np.isclose(u, high)) | (
-            (free < low) & np.isclose(u, low)
+        held: Array = ((free > high) & _close(u, high)) | (
+            (free < low) & _close(u, low)
         )
         overruled: Array = other | held.any(axis=-1, keepdims=True)
         return overruled
@@ -265,11 +281,40 @@ class PredictiveController(Controller):
     def _decide(self, memory: Memory, r: Array, v: Array) -> Move:
         theta = self._known(memory.vector, r, v)
         z = theta @ self.program.free.T
-        kept = (self.program.room(z, theta) >= -self.program.slack).all(axis=-1)
         move = self._move(self.first_move.value(z, theta), r, decision=z, known=theta)
-        for i in np.flatnonzero(~kept).tolist():
-            self._decide_limited(move, memory, i)
+        kept = self.program.free_is_kept(theta)
+        if not kept.all():
+            self._decide_all_limited(move, memory, np.flatnonzero(~kept))
         return self._finish(move, memory)
+
+    def _decide_all_limited(self, move: Move, memory: Memory, loops: Array) -> None:
+        """Fill in the rows where the free optimum breaks a limit."""
+        alone = loops
+        if self.regions is not None and self.ranked.strict:
+            own_bounds = self._within(self.last_input(memory.vector[loops]))
+            self._decide_shared(self.regions, move, memory, loops[own_bounds])
+            alone = loops[~own_bounds]
+        for i in alone.tolist():
+            self._decide_limited(move, memory, i)
+
+    def _decide_shared(
+        self, regions: Regions, move: Move, memory: Memory, loops: Array
+    ) -> None:
+        """Fill in loops whose programs differ in the known vector alone."""
+
+        def solve_one(number: int) -> Array | None:
+            i = int(loops[number])
+            self._decide_limited(move, memory, i)
+            limited = move.status[i] == Status.LIMITED
+            return move.multipliers[i] if limited else None
+
+        known = move.known[loops]
+        for numbers, z, multipliers in regions.answers(known, solve_one):
+            rows, first = loops[numbers], self.first_move
+            move.decision[rows], move.multipliers[rows] = z, multipliers
+            move.u[rows] = one_by_one(first.gain, z)
+            move.u[rows] += one_by_one(first.known, known[numbers])
+            move.status[rows] = Status.LIMITED
 
     def _known(self, vector: Array, r: Array, v: Array) -> Array:
         knows, loops = self.knowledge, len(vector)
@@ -336,16 +381,17 @@ class PredictiveController(Controller):
     def _finish(self, move: Move, memory: Memory) -> Move:
         """Apply the input's limits once more and state the cost."""
         clipped = self.clip(move.u, self.last_input(memory.vector))
-        cut = np.abs(clipped - move.u).max(axis=-1) > 1e-6
-        move.status[cut & (move.status < Status.CLIPPED)] = Status.CLIPPED
-        move.u[:] = clipped
+        if not np.array_equal(clipped, move.u):
+            cut = np.abs(clipped - move.u).max(axis=-1) > 1e-6
+            move.status[cut & (move.status < Status.CLIPPED)] = Status.CLIPPED
+            move.u[:] = clipped
         move.cost[:] = self.program.cost(move.decision, move.known)
         return move
 
     def _reachable(self, before: Array) -> tuple[Array, Array]:
         """Bounds of the rows, level limits widened to what the rates can reach."""
         low, high = self.program.lower, self.program.upper
-        if ((before >= self.limits_u[0]) & (before <= self.limits_u[1])).all():
+        if self._within(before):
             return low, high
         low, high = low.copy(), high.copy()
         for row, (name, channel, step) in enumerate(self.program.labels):
@@ -356,9 +402,21 @@ class PredictiveController(Controller):
                 low[row] = min(low[row], before[channel] + moves * fastest)
         return low, high
 
+    def _within(self, u: Array) -> Array:
+        """Whether inputs (..., n_u) keep the level limits, (...)."""
+        low, high = self.limits_u
+        within: Array = np.all((u >= low) & (u <= high), axis=-1)
+        return within
+
     @cached_property
     def _move_steps(self) -> Array:
         return np.unique([row.step for row in self.program.labels if row.name == "u"])
+
+
+def _close(u: Array, side: Array) -> Array:
+    """As ``numpy.isclose`` for finite inputs, and much faster."""
+    close: Array = np.abs(u - side) <= 1e-8 + 1e-5 * np.abs(side)
+    return close
 
 
 def _cut(solution: Solution, n_z: int, multipliers: Array) -> Solution:

@@ -30,6 +30,9 @@ FEASIBLE = 1e-9
 ACCEPTED = 1e-8
 """Largest relative KKT residual of a solution that is applied."""
 
+HELD = 1e-9
+"""Smaller multipliers count as zero, relative to 1 + the largest."""
+
 
 class Row(NamedTuple):
     """What a row limits: the kind of signal, its channel and its step, from 0."""
@@ -118,8 +121,8 @@ class QuadraticProgram:
 
     def cost(self, z: Array, theta: Array) -> Array:
         """Full cost J, constant included, for z (..., n_z) and theta (..., n_theta)."""
-        quadratic = ((z @ self.H + 2.0 * theta @ self.f.T) * z).sum(axis=-1)
-        cost: Array = quadratic + ((theta @ self.constant) * theta).sum(axis=-1)
+        quadratic = _products(z @ self.H + 2.0 * theta @ self.f.T, z)
+        cost: Array = quadratic + _products(theta @ self.constant, theta)
         return cost
 
     def room(self, z: Array, theta: Array) -> Array:
@@ -133,6 +136,20 @@ class QuadraticProgram:
         """How far each row may miss its limits and still count as kept, (rows,)."""
         nearest = np.minimum(np.abs(self.lower), np.abs(self.upper))
         return FEASIBLE * (1.0 + nearest)
+
+    @cached_property
+    def free_rows(self) -> Array:
+        """Gain (rows, n_theta) of the rows at the optimum without limits."""
+        gain: Array = self.M @ self.free + self.offset
+        return gain
+
+    def free_is_kept(self, theta: Array) -> Array:
+        """Whether the optima without limits of (loops, n_theta) keep all rows."""
+        value = self.free_rows @ theta.T  # reducing columns is much faster than rows
+        low, high = self.lower - self.slack, self.upper + self.slack
+        inside = (value >= low[:, None]) & (value <= high[:, None])
+        kept: Array = np.all(inside, axis=0)
+        return kept
 
     def without(self, *names: str) -> QuadraticProgram:
         """Return the program without the rows of these names (6.1.2)."""
@@ -424,19 +441,48 @@ def kkt_residual(problem: Problem, z: Array, multipliers: Array) -> float:
     Stationarity is measured against the size of its terms, feasibility against
     1 + abs(bound), complementarity against the size of the objective's terms.
     """
+    return float(kkt_residuals(problem, z, multipliers))
+
+
+def kkt_residuals(problem: Problem, z: Array, multipliers: Array) -> Array:
+    """As ``kkt_residual`` for many problems of equal H and M, one a column.
+
+    f, lower and upper of the problem are columns too, as z and multipliers are.
+    """
     Hz, value = problem.H @ z, problem.M @ z
-    push = problem.M.T @ multipliers
-    terms = max(
-        np.abs(Hz).max(), np.abs(problem.f).max(), np.abs(push).max(initial=0.0)
-    )
-    stationarity = np.abs(Hz + problem.f + push).max() / (1.0 + terms)
+    push, f = problem.M.T @ multipliers, problem.f
+    terms = np.maximum(np.maximum(_largest(Hz), _largest(f)), _largest(push))
+    stationarity = _largest(Hz + f + push) / (1.0 + terms)
     below, above = problem.lower - value, value - problem.upper
     nearest = np.minimum(np.abs(problem.lower), np.abs(problem.upper))
     broken = np.maximum(np.maximum(below, above), 0.0) / (1.0 + nearest)
     gap = np.where(multipliers > 0, above, np.where(multipliers < 0, below, 0.0))
-    size = 1.0 + np.abs(z @ Hz) + np.abs(problem.f @ z)
-    complementarity = np.abs(gap * multipliers).max(initial=0.0) / size
-    return float(max(stationarity, broken.max(initial=0.0), complementarity))
+    size = 1.0 + np.abs((z * Hz).sum(axis=0)) + np.abs((f * z).sum(axis=0))
+    complementarity = _largest(gap * multipliers) / size
+    residuals: Array = np.maximum(
+        np.maximum(stationarity, _largest(broken)), complementarity
+    )
+    return residuals
+
+
+def _largest(columns: Array) -> Array:
+    largest: Array = np.abs(columns).max(axis=0, initial=0.0)
+    return largest
+
+
+def _products(a: Array, b: Array) -> Array:
+    """Scalar products along the last axis."""
+    products: Array = np.einsum("...i,...i->...", a, b)
+    return products
+
+
+def one_by_one(matrix: Array, vectors: Array) -> Array:
+    """Products with vectors (loops, n), the same whichever others there are.
+
+    To the last digit: in one product of matrices rounding depends on their sizes.
+    """
+    products: Array = (matrix @ vectors[..., None])[..., 0]
+    return products
 
 
 def _polish(
@@ -444,7 +490,7 @@ def _polish(
 ) -> tuple[Array, Array, float]:
     """Solve the equations of the active rows exactly, if that is the better answer."""
     largest = np.abs(multipliers).max(initial=0.0)
-    held = np.abs(multipliers) > 1e-9 * (1.0 + largest)
+    held = np.abs(multipliers) > HELD * (1.0 + largest)
     multipliers = np.where(held, multipliers, 0.0)
     residual = kkt_residual(problem, z, multipliers)
     if residual <= 1e-2 * ACCEPTED or not held.any():

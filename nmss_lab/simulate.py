@@ -11,11 +11,18 @@ import numpy as np
 
 from nmss_lab.controller import Controller, Memory, Move, Status
 from nmss_lab.models import Array, DifferenceModel, LinearPlant, Numbers, Plant
+from nmss_lab.parallel import in_order
 from nmss_lab.predictive import PredictiveController
 from nmss_lab.state_dependent import StateDependentModel
 
 Equation = DifferenceModel | StateDependentModel
 """A model that can be its own plant."""
+
+TOLD = "w", "status", "cost", "multipliers", "iterations"
+"""What every run tells of its moves."""
+
+DIVERGED = 1e9
+"""Output beyond which a loop of an ensemble is given up."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,8 +122,10 @@ class Run:
         Seconds.
     y, measured, w, r : arrays (N, n_y)
         Output with its disturbance, the same with noise, governed and actual reference.
+        In a loop of an ensemble that diverged, y, measured, y_fine and cost are nan
+        from where it was given up.
     u, du : arrays (N, n_u)
-        Applied input and its change.
+        Applied input and its change; the last input before a loop was given up stays.
     v : array (N, n_v)
     status : integer array (N,)
         Codes of ``Status``.
@@ -125,6 +134,7 @@ class Run:
         Of the rows of the controller's program, see ``Move``; zero where no limit
         holds.
     iterations : integer array (N,)
+        Of the solver; 0 where no program had to be solved.
     moves : Move, optional
         All decisions, one row a sample: ``trail`` reads predictions from them.
     t_fine, y_fine : arrays (M,), (M, n_y)
@@ -256,8 +266,13 @@ def closed_loops(
 ) -> list[Run]:
     """Run one controller on many linear plants in lock step.
 
-    All unconstrained decisions of a sample are one matrix product; only loops whose
-    limits are hit go to a quadratic program.
+    All unconstrained decisions of a sample are one matrix product.  Loops whose limits
+    are hit are answered from solutions that others have met, with the same active
+    limits, and only the rest by a quadratic program: see ``nmss_lab.regions``.
+
+    A loop that diverges does not end the others: once an output exceeds 1e9 or is not
+    finite, the loop is given up.  Its outputs are nan from there on, its input stays
+    and its moves are refused.
 
     Parameters
     ----------
@@ -299,7 +314,7 @@ def many_loops(
     ValueError
         As ``samples``.
     """
-    yield from (executor.map if executor else map)(_loop_of, tasks)
+    yield from in_order(_loop_of, tasks, executor)
 
 
 def _loop_of(task: tuple[Plant | Equation, Controller, Scenario]) -> Run:
@@ -352,9 +367,10 @@ class _Stacked:
         shapes = {(p.A.shape, p.B.shape, p.C.shape, p.dt) for p in plants}
         if len(shapes) > 1:
             raise ValueError(f"plants differ in size or dt: {sorted(map(str, shapes))}")
-        self.A, self.B, self.C, self.G = (
-            np.stack([getattr(p, name) for p in plants]) for name in "ABCG"
+        A, B, self.C, G = (
+            np.array([getattr(p, name) for p in plants]) for name in "ABCG"
         )
+        self.n_x, self.ABG = first.n_x, np.concatenate([A, B, G], axis=2)
         self.times = _times(first)
         if self.times is not None:
             parts = [p.between for p in plants]
@@ -363,23 +379,29 @@ class _Stacked:
             )
 
     def reset(self, u0: Array, v0: Array, y0: Array | None) -> Array:
+        if not (u0.any() or v0.any() or np.any(0.0 if y0 is None else y0)):
+            return np.zeros((self.size, self.n_x))
         return np.stack([plant.reset(u0, v0, y0) for plant in self.plants])
 
     def output(self, state: Array) -> Array:
-        return _each(self.C, state)
+        with np.errstate(over="ignore", invalid="ignore"):  # a loop may diverge
+            return _each(self.C, state)
 
     def step(self, state: Array, u: Array, v: Array) -> Array:
-        return _each(self.A, state) + _each(self.B, u) + _each(self.G, v)
+        both = np.concatenate([state, u, v], axis=1)
+        with np.errstate(over="ignore", invalid="ignore"):
+            return _each(self.ABG, both)
 
     def between(self, state: Array, u: Array, v: Array) -> Array | None:
         """Return outputs (loops, m, n_y) between this sample and the next."""
         if self.times is None:
             return None
-        inside: Array = (
-            np.einsum("rmij,rj->rmi", self.between_C, state)
-            + np.einsum("rmij,rj->rmi", self.between_B, u)
-            + np.einsum("rmij,rj->rmi", self.between_G, v)
-        )
+        with np.errstate(over="ignore", invalid="ignore"):
+            inside: Array = (
+                np.einsum("rmij,rj->rmi", self.between_C, state)
+                + np.einsum("rmij,rj->rmi", self.between_B, u)
+                + np.einsum("rmij,rj->rmi", self.between_G, v)
+            )
         return inside
 
 
@@ -412,6 +434,7 @@ def _lock_step(
     )
     r = scenario.of("reference", model.n_y)
     v = scenario.of("v", plants.n_v)
+    loops_v = np.broadcast_to(v[:, None], (len(v), plants.size, plants.n_v))
     u0, v0 = _constant(scenario.u0, model.n_u), _constant(scenario.v0, plants.n_v)
     state = plants.reset(u0, v0, scenario.y0)
     y0 = plants.output(state)
@@ -419,10 +442,13 @@ def _lock_step(
     ahead_r = _padded(r, controller.preview)
     ahead_v = _padded(v, controller.forecast_steps)
     knows_v = model.n_v > 0
+    u = np.broadcast_to(u0, (plants.size, model.n_u))
+    given_up = np.zeros(plants.size, dtype=bool)
     for k in range(len(scenario)):
         y = plants.output(state) + d_y[k]
-        if not np.isfinite(y).all():
-            raise ValueError(f"the loop diverged: y is no longer finite at sample {k}")
+        given_up = given_up | _diverged(plants, y, k)
+        if given_up.any():
+            y[given_up], state[given_up], memory.vector[given_up] = np.nan, 0.0, 0.0
         measured = y + noise[k]
         memory = controller.measure(memory, measured, r[k], v[k] if knows_v else None)
         move = controller.decide(
@@ -431,13 +457,25 @@ def _lock_step(
             ahead_v[k : k + 1 + controller.forecast_steps] if knows_v else None,
         )
         wanted = np.where(np.isfinite(manual[k]), manual[k], move.u)
-        u = np.clip(wanted, *scenario.actuator)
+        u_before, u = u, np.clip(wanted, *scenario.actuator)
         into = u + d_u[k]
-        loops_v = np.broadcast_to(v[k], (plants.size, plants.n_v))
-        inside = plants.between(state, into, loops_v)
+        inside = plants.between(state, into, loops_v[k])
+        if given_up.any():
+            u[given_up] = u_before[given_up]
+            move.cost[given_up], move.multipliers[given_up] = np.nan, 0.0
         yield Sample(k, y, measured, u, move, memory, inside)
         memory = controller.apply(memory, u, move, into if scenario.seen else None)
-        state = plants.step(state, into, loops_v)
+        state = plants.step(state, into, loops_v[k])
+
+
+def _diverged(plants: _Single | _Stacked, y: Array, k: int) -> Array:
+    """Which loops are to be given up, (loops,); a single loop raises."""
+    if isinstance(plants, _Stacked):
+        bounded: Array = np.all(np.abs(y) <= DIVERGED, axis=1)
+        return ~bounded
+    if not np.isfinite(y).all():
+        raise ValueError(f"the loop diverged: y is no longer finite at sample {k}")
+    return np.zeros(1, dtype=bool)
 
 
 def _start(
@@ -448,11 +486,38 @@ def _start(
     r0: Array,
     z0: Numbers | None,
 ) -> Memory:
-    """Memories of all loops, stacked."""
+    """Memories of all loops, stacked; loops that start alike are made once."""
     known_v = v0 if controller.model.n_v else None
-    starts = [controller.start(y, u0, known_v, r0, z0) for y in y0]
+    kinds, of_loop = np.unique(y0, axis=0, return_inverse=True)
+    starts = [controller.start(y, u0, known_v, r0, z0) for y in kinds]
     names = Memory.__dataclass_fields__
-    return Memory(*(np.stack([getattr(m, name) for m in starts]) for name in names))
+    return Memory(
+        *(
+            np.stack([getattr(m, name) for m in starts])[of_loop.ravel()]
+            for name in names
+        )
+    )
+
+
+class _Log:
+    """What happens to all loops, written sample by sample, time first."""
+
+    def __init__(self, samples: int) -> None:
+        self.samples = samples
+        self.arrays: dict[str, Array] = {}
+
+    def write(self, k: int, **values: Array) -> None:
+        """Note the values (loops, ...) of sample k."""
+        for name, value in values.items():
+            if name not in self.arrays:
+                shape = self.samples, *value.shape
+                self.arrays[name] = np.zeros(shape, value.dtype)
+            if value.any():  # pages of zeros take neither time nor memory
+                self.arrays[name][k] = value
+
+    def of(self, i: int) -> dict[str, Array]:
+        """Values (samples, ...) of loop i."""
+        return {name: values[:, i] for name, values in self.arrays.items()}
 
 
 def _collect(
@@ -461,62 +526,50 @@ def _collect(
     scenario: Scenario,
     keep_moves: bool,
 ) -> list[Run]:
-    taken = list(_lock_step(plants, controller, scenario))
-    moves = Move(
-        *(
-            np.stack([getattr(s.move, name) for s in taken], axis=1)
-            for name in Move.__dataclass_fields__
-        )
-    )
-    y = np.stack([s.y for s in taken], axis=1)
-    measured = np.stack([s.measured for s in taken], axis=1)
-    u = np.stack([s.u for s in taken], axis=1)
-    before = _constant(scenario.u0, controller.model.n_u)
-    du = np.diff(u, axis=1, prepend=np.broadcast_to(before, (len(u), 1, u.shape[2])))
-    t = np.arange(len(taken)) * plants.dt
-    t_fine, y_fine = _fine(plants, taken, scenario, t, y)
-    r, v = scenario.reference, scenario.of("v", plants.n_v)
+    N = len(scenario)
+    log, moves = _Log(N), _Log(N)
+    deciding = controller.together() if isinstance(plants, _Stacked) else controller
+    for sample in _lock_step(plants, deciding, scenario):
+        log.write(sample.k, y=sample.y, measured=sample.measured, u=sample.u)
+        log.write(sample.k, **{name: getattr(sample.move, name) for name in TOLD})
+        if sample.between is not None:
+            log.write(sample.k, y_fine=sample.between)
+        if keep_moves:
+            moves.write(sample.k, **vars(sample.move))
+    u, before = log.arrays["u"], _constant(scenario.u0, controller.model.n_u)
+    before = np.broadcast_to(before, (1, *u.shape[1:]))
+    log.arrays["du"] = np.diff(u, axis=0, prepend=before)
+    t = np.arange(N) * plants.dt
+    t_fine, log.arrays["y_fine"] = _fine(plants, log, scenario, t)
     return [
         Run(
-            controller,
-            t,
-            y[i],
-            measured[i],
-            r,
-            moves.w[i],
-            u[i],
-            du[i],
-            v,
-            moves.status[i],
-            moves.cost[i],
-            moves.multipliers[i],
-            moves.iterations[i],
-            t_fine,
-            y_fine[i],
-            Move(*(getattr(moves, name)[i] for name in Move.__dataclass_fields__))
-            if keep_moves
-            else None,
+            controller=controller,
+            t=t,
+            r=scenario.reference,
+            v=scenario.of("v", plants.n_v),
+            t_fine=t_fine,
+            moves=Move(**moves.of(i)) if keep_moves else None,
+            **log.of(i),
         )
         for i in range(plants.size)
     ]
 
 
 def _fine(
-    plants: _Single | _Stacked,
-    taken: list[Sample],
-    scenario: Scenario,
-    t: Array,
-    y: Array,
+    plants: _Single | _Stacked, log: _Log, scenario: Scenario, t: Array
 ) -> tuple[Array, Array]:
-    """Time and output between the samples, the first sample included."""
+    """Time and outputs (M, loops, n_y) between the samples, the first included."""
+    y = log.arrays["y"]
     if plants.times is None:
         return t, y
-    inside = [s.between for s in taken if s.between is not None]
-    d_y = scenario.of("output_disturbance", y.shape[2])
-    blocks = np.stack(inside, axis=1) + d_y[:, None]
-    fine = blocks.reshape(plants.size, -1, y.shape[2])
+    d_y = scenario.of("output_disturbance", plants.n_y)
+    given_up = np.isnan(y)
+    blocks = np.moveaxis(log.arrays["y_fine"], 2, 1) + d_y[:, None, None]
+    blocks = np.where(given_up[:, None], np.nan, blocks)
+    fine = np.concatenate([y[:1], blocks.reshape(-1, *y.shape[1:])])
+    fine[: -1 : len(plants.times)][given_up] = np.nan
     t_fine = (t[:, None] + plants.times).ravel()
-    return np.concatenate([t[:1], t_fine]), np.concatenate([y[:, :1], fine], axis=1)
+    return np.concatenate([t[:1], t_fine]), fine
 
 
 def _check_sizes(plants: _Single | _Stacked, controller: Controller) -> None:

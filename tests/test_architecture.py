@@ -46,6 +46,7 @@ ORDER = [
     "files",
     "reproduce",
     "plots",
+    "cli_studies",
     "cli",
 ]
 """Each module imports only modules before it."""

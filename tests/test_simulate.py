@@ -1,6 +1,7 @@
 """What every controller promises in a closed loop, and the loop itself."""
 
 import dataclasses
+import pickle
 
 import numpy as np
 import pytest
@@ -8,12 +9,13 @@ from conftest import DECISION, REPLAY
 from strategies import random_model, roll_out
 
 from nmss_lab import qp
+from nmss_lab.cases import shell_model
 from nmss_lab.controller import Limits, Status
 from nmss_lab.design import Design
 from nmss_lab.governor import governor
-from nmss_lab.models import DifferenceModel
+from nmss_lab.models import Between, DifferenceModel, LinearPlant
 from nmss_lab.mpc import STRUCTURES, integral_of_error, wang_young
-from nmss_lab.pip import lq_gain, pip
+from nmss_lab.pip import lq_gain, pip, pole_gain
 from nmss_lab.predict import Horizon
 from nmss_lab.simulate import Scenario, closed_loop, closed_loops, samples
 
@@ -520,6 +522,231 @@ def test_status_is_told_in_sentences():
     )
     assert sum(int(each.split()[0]) for each in run.sentences) == 40
     assert any("clipped" in each for each in run.sentences)
+
+
+# --- Ensembles -----------------------------------------------------------------------
+
+TOGETHER = 1e-8
+"""A loop in an ensemble and alone: unique optima, found in two ways."""
+
+
+def spread(model, loops, seed=5):
+    """Return plants around a model."""
+    factors = np.random.default_rng(seed).uniform([0.8, 0.97], [1.25, 1.0], (loops, 2))
+    return [model.varied(*each).plant() for each in factors]
+
+
+def check_together(plants, controller, scenario):
+    """Every loop of an ensemble runs as if alone; return the runs of the ensemble."""
+    together = closed_loops(plants, controller, scenario, keep_moves=True)
+    for plant, found in zip(plants, together, strict=True):
+        alone = closed_loop(plant, controller, scenario)
+        assert np.array_equal(found.status, alone.status)
+        for field in ("y", "measured", "u", "du", "w"):
+            pair = getattr(found, field), getattr(alone, field)
+            assert pair[0] == pytest.approx(pair[1], abs=TOGETHER), field
+        # rows that depend on each other share their push in more than one way
+        pushes = [run.multipliers @ controller.program.M for run in (found, alone)]
+        for pair in (
+            (found.moves.decision, alone.moves.decision),
+            (found.cost, alone.cost),
+            pushes,
+        ):
+            size = 1.0 + np.abs(pair[1]).max()
+            assert np.abs(pair[0] - pair[1]).max() <= 10 * TOGETHER * size
+    return together
+
+
+def shared_share(runs):
+    """Share of the limited samples at which a region answered, not the solver."""
+    status = np.array([run.status for run in runs])
+    solved = np.array([run.iterations for run in runs]) > 0
+    limited = status == Status.LIMITED
+    assert limited.any()
+    return (limited & ~solved).sum() / limited.sum()
+
+
+TIGHT = Limits(u=(-0.5, 0.5), du=(-0.137, 0.137), y=(-1.2, 1.2))
+
+
+@pytest.mark.parametrize("name", QP_STRUCTURES)
+def test_limited_loops_learn_from_each_other(name, rng):
+    """Limits on u, du and y hold; most answers come from another loop's."""
+    scenario = Scenario(steps(1.3, -1.3, each=30), v=0.1 * rng.standard_normal(60))
+    controller = build(name, TIGHT)
+    runs = check_together(spread(MODEL, 25), controller, scenario)
+    assert shared_share(runs) > 0.5
+    rows = np.any([run.active.any(axis=0) for run in runs], axis=0)
+    kinds = {controller.program.labels[i].name for i in np.flatnonzero(rows)}
+    assert kinds == {"u", "du", "y"}
+
+
+@pytest.mark.parametrize("name", ["wang_young", "forward_path", "integral_of_error"])
+def test_limited_loops_of_many_channels_learn_from_each_other(name):
+    """The Shell fractionator with three inputs and outputs, and a plant of two."""
+    shell, two = shell_model(), random_model(np.random.default_rng(3), 2, 2, radius=0.8)
+    for model in (shell, two):
+        p = model.n_y
+        limits = Limits(u=(-0.4, 0.4), du=(-0.113, 0.113), y=(-5.0, 5.0))
+        weights = {"Q": 1.0, "R": 0.5}
+        controller = STRUCTURES[name](model, Horizon(12, 4), limits=limits, **weights)
+        r = np.repeat([np.full(p, 0.3), np.linspace(-0.4, 0.4, p)], 20, axis=0)
+        runs = check_together(spread(model, 12), controller, Scenario(r))
+        assert shared_share(runs) > 0.2
+
+
+@pytest.mark.parametrize("reference", ["held", "preview"])
+def test_governed_loops_learn_from_each_other(reference):
+    """Also where the decision cannot move the present input."""
+    model = DifferenceModel([-1.7, 1.0], [-1.0, 2.0])
+    limits = Limits(u=(-2.0, 2.0), du=(-0.5, 0.5))
+    K = pole_gain(model, [0.0, 0.0, 0.2, 0.2])
+    controller = governor(model, K, 10, limits, reference)
+    plants = [model.varied(f).plant() for f in np.linspace(0.97, 1.03, 12)]
+    runs = check_together(plants, controller, Scenario(steps(3.0, -3.0, each=25)))
+    assert shared_share(runs) > 0.3
+
+
+@pytest.mark.parametrize("outputs", ["hard", "soft", "priority"])
+def test_limits_that_give_way_do_so_in_an_ensemble_too(outputs):
+    """No region of the whole program stands in for rows dropped or softened."""
+    limits = Limits(u=(-2, 2), y=([-1, -1], [1, 1]), outputs=outputs, priority=(1, 2))
+    controller = wang_young(MIXED, Horizon(8, 3), 1.0, 0.1, limits)
+    push = np.zeros((30, 2))
+    push[5:10], push[15:20] = [1.5, 0.9], [3.0, -3.0]
+    scenario = Scenario(np.zeros((30, 2)), output_disturbance=push)
+    runs = check_together(spread(MIXED, 8), controller, scenario)
+    gave_way = Status.DROPPED if outputs == "hard" else Status.SOFTENED
+    assert all((run.status == gave_way).any() for run in runs)
+    solved = np.array([run.iterations for run in runs]) > 0
+    told = np.array([run.status for run in runs])
+    assert solved[told == gave_way].all()
+    if outputs == "soft":  # a price is not in the program that regions are of
+        assert solved[told == Status.LIMITED].all()
+    else:
+        assert shared_share(runs) > 0.1
+
+
+def test_input_outside_its_limits_has_bounds_of_its_own_in_an_ensemble():
+    """They are wider there, so that no region fits; afterwards regions do."""
+    controller = build("wang_young", LIMITS)
+    scenario = Scenario(np.zeros(40), v=np.zeros(40), u0=[2.0], y0=[6.0])
+    runs = check_together(spread(MODEL, 10), controller, scenario)
+    outside = np.array([run.u[:, 0] for run in runs]) > 1.0
+    solved = np.array([run.iterations for run in runs]) > 0
+    assert solved[:, 1:][outside[:, :-1]].all()
+    assert outside.any()
+    assert shared_share(runs) > 0.0
+
+
+@pytest.mark.parametrize("reading", ["held", "zero"])
+def test_sums_of_the_error_stop_in_an_ensemble_too(reading):
+    """Promise 3: the input leaves its limit as soon as a single loop's does."""
+    lag = DifferenceModel([-0.9], [0.1])
+    controller = integral_of_error(
+        lag, Horizon(12, 4), 0.1, 0.1, Limits(u=(-1, 1)), reading
+    )
+    plants = [lag.varied(f).plant() for f in np.linspace(0.9, 1.1, 7)]
+    runs = check_together(plants, controller, Scenario(steps(3.0, 0.5, each=100)))
+    for run in runs:
+        assert run.u[95:100] == pytest.approx(1.0)
+        assert run.u[102, 0] < 1.0 - DECISION
+        assert run.y[-1, 0] == pytest.approx(0.5, abs=1e-2)
+
+
+def test_ensemble_gives_the_same_numbers_always(rng):
+    """To the last digit: with the same controller again, and with a fresh one."""
+    scenario = Scenario(steps(1.3, -1.3, each=30), v=0.1 * rng.standard_normal(60))
+    plants, controller = spread(MODEL, 20), build("wang_young", TIGHT)
+    before = closed_loops(plants, controller, scenario)
+    closed_loops(spread(MODEL, 30, seed=8), controller, scenario)
+    for other in (controller, build("wang_young", TIGHT)):
+        after = closed_loops(plants, other, scenario)
+        for a, b in zip(before, after, strict=True):
+            for field in ("y", "u", "status", "cost", "multipliers", "iterations"):
+                assert np.array_equal(getattr(a, field), getattr(b, field)), field
+    assert all(run.controller is controller for run in before)
+    assert controller.regions is None
+    copy = pickle.loads(pickle.dumps(before[3]))
+    assert np.array_equal(copy.u, before[3].u)
+
+
+WILD = DifferenceModel([-4.0], [0.1, 0.08], [0.05, 0.02])
+"""No input within ``TIGHT`` holds it."""
+
+
+@pytest.mark.parametrize("name", ["wang_young", "integral_of_error", "governor", "pip"])
+def test_loop_that_diverges_leaves_the_others_alone(name, rng):
+    """To the last digit, also those that hit limits; and it says where it ended."""
+    scenario = Scenario(
+        steps(1.3, -1.3, each=40),
+        v=0.1 * rng.standard_normal(80),
+        noise=0.05 * rng.standard_normal(80),
+    )
+    controller = build(name, TIGHT)
+    plants = spread(MODEL, 15)
+    wild = WILD.varied().plant()
+    wild = LinearPlant(*_padded(wild, plants[0].n_x), dt=wild.dt)
+    lost = closed_loops([*plants[:4], wild, *plants[5:]], controller, scenario)
+    well = closed_loops(plants, controller, scenario)
+    for i in {*range(15)} - {4}:
+        for field in ("y", "u", "status", "cost", "multipliers", "w", "measured"):
+            assert np.array_equal(getattr(lost[i], field), getattr(well[i], field))
+        assert np.isfinite(lost[i].y).all()
+    run = lost[4]
+    end = int(np.argmax(np.isnan(run.y[:, 0])))
+    assert 5 < end < 75
+    assert np.abs(run.y[:end]).max() <= 1e9
+    assert np.isfinite(run.u).all()
+    assert (run.u[end:] == run.u[end - 1]).all()
+    assert not run.du[end:].any()
+    for field in ("y", "measured", "y_fine", "cost"):
+        assert np.isnan(getattr(run, field)[end:]).all(), field
+        assert np.isfinite(getattr(run, field)[:end]).all(), field
+    assert (run.status[end:] >= Status.REFUSED).all()
+    assert not run.active[end:].any()
+
+
+def _padded(plant, n_x):
+    """Matrices of a plant with states that do nothing."""
+    more = n_x - plant.n_x
+    return (
+        np.pad(plant.A, ((0, more), (0, more))),
+        np.pad(plant.B, ((0, more), (0, 0))),
+        np.pad(plant.C, ((0, 0), (0, more))),
+        np.pad(plant.G, ((0, more), (0, 0))),
+    )
+
+
+@pytest.mark.parametrize("pole", [3.0, 1e5, 1e200])
+def test_output_between_samples_ends_with_its_loop(pole):
+    """No number that has run away is left, and nothing overflows for long."""
+
+    def plant(a):
+        inside = Between(
+            np.array([0.5, 1.0]),
+            np.full((2, 1, 1), a),
+            np.ones((2, 1, 1)),
+            np.zeros((2, 1, 0)),
+        )
+        return LinearPlant(
+            np.array([[a]]), np.ones((1, 1)), np.ones((1, 1)), between=inside
+        )
+
+    # what this model expects where nothing is measured runs away too
+    model = DifferenceModel([-3.0], [1.0])
+    controller = wang_young(model, Horizon(5, 2), 1.0, 1.0, Limits(u=(-1, 1)))
+    scenario = Scenario(
+        np.ones(700), input_disturbance=3.0 * np.ones(700), noise=np.ones(700)
+    )
+    tame, wild = closed_loops([plant(0.5), plant(pole)], controller, scenario)
+    end = int(np.argmax(np.isnan(wild.y[:, 0])))
+    assert end > 0
+    assert np.isfinite(wild.y_fine[: 2 * end]).all()
+    assert np.isnan(wild.y_fine[2 * end :]).all()
+    assert len(wild.y_fine) == len(wild.t_fine) == 1401
+    assert np.isfinite(tame.y_fine).all()
+    assert np.isfinite(tame.y).all()
 
 
 # --- Errors --------------------------------------------------------------------------
