@@ -1,4 +1,4 @@
-"""The command ``nmss-lab``: serve pages, reproduce the thesis, simulate, identify.
+"""The command ``nmss-lab``: serve pages, reproduce, simulate, identify, study, tune.
 
 Numerical and page libraries are imported inside the commands that need them, so
 that ``--version`` and ``--help`` answer at once.
@@ -10,11 +10,13 @@ import json
 import os
 import signal
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from nmss_lab import __version__
+from nmss_lab.cli_studies import add_study, add_tune
+from nmss_lab.cli_studies import line as _line
 
 __all__ = ["main"]
 
@@ -31,12 +33,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     -------
     int
         0 after success, 1 after an error that is the caller's to mend.  Arguments
-        that cannot be read leave through ``SystemExit(2)``, as argparse does.
+        that cannot be read leave through ``SystemExit(2)``, as argparse does.  130
+        where Ctrl-C ended a study or a search, whose results so far are printed.
     """
     arguments = _parser().parse_args(argv)
-    command: Callable[[argparse.Namespace], None] = arguments.command
+    command: Callable[[argparse.Namespace], int | None] = arguments.command
     try:
-        command(arguments)
+        return command(arguments) or 0
     except BrokenPipeError:  # whoever read the output, such as head, has enough
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115 - closed with the process
     except (ValueError, OSError) as error:
@@ -58,6 +61,8 @@ def _parser() -> argparse.ArgumentParser:
     _add_reproduce(commands)
     _add_simulate(commands)
     _add_identify(commands)
+    add_study(commands)
+    add_tune(commands)
     return parser
 
 
@@ -276,11 +281,6 @@ def _print_runs(case: Any, runs: Mapping[str, Any]) -> None:
             print(_line(v if isinstance(v, str) else f"{v:.5g}" for v in row.values()))
     for name, run in runs.items():
         print(f"\n{name}", *run.sentences, sep="\n- ")
-
-
-def _line(cells: Iterable[str]) -> str:
-    first, *rest = cells
-    return f"{first:<24}" + "".join(f"{cell:>12}" for cell in rest)
 
 
 def _write_run(run: Any, file: str) -> None:

@@ -90,7 +90,8 @@ def match(
     Raises
     ------
     ValueError
-        If the structure is another, or K does not fit the model.
+        If the structure is another, K does not fit the model, or ``starts`` is not
+        positive.
     """
     allowed = "integral_of_error", "wang_young", "forward_path"
     model = design.model
@@ -98,6 +99,8 @@ def match(
         raise ValueError(
             f'structure = "{design.structure}": expected one of {", ".join(allowed)}'
         )
+    if starts < 1:
+        raise ValueError(f"starts = {starts}: expected at least 1")
     form = integral_of_error_form(model)
     K = gain("K", K, form)
     wanted = _coefficients(_polynomials_of_gain(K, model))

@@ -11,6 +11,7 @@ import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
+from contextlib import closing
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
@@ -282,8 +283,9 @@ def monte_carlo_parts(
         )
         for first in range(0, n, PART)
     ]
-    for _, part in each(_part, tasks, executor):
-        yield part
+    with closing(each(_part, tasks, executor)) as done:
+        for _, part in done:
+            yield part
 
 
 def join(parts: Sequence[MonteCarlo]) -> MonteCarlo:
@@ -424,15 +426,22 @@ def _measured(run: Run, channel: int) -> dict[str, float | bool]:
     """Measures of one loop; what cannot be told of a loop given up is infinite."""
     diverged = bool(np.isnan(run.y).any())
     failed = np.isin(run.status, (Status.SHIFTED, Status.HELD))
+    worst = [part.worst for part in violations(run).values()]
+    if diverged and not np.isfinite(np.hstack(_limits_of_y(run))).any():
+        worst.pop()  # y has no limit that it could be beyond
     told: dict[str, float | bool] = {
         **summary(run, channel),
         "peak": float(np.abs(run.y_fine[:, channel]).max()),
-        "excess": max(part.worst for part in violations(run).values()),
+        "excess": float(np.max(worst)),
         "failures": float(failed.mean()),
     }
     if diverged:
         told |= {name: np.inf for name, value in told.items() if not np.isfinite(value)}
     return {**told, "diverged": diverged}
+
+
+def _limits_of_y(run: Run) -> tuple[Array, Array]:
+    return run.controller.limits.of("y", run.y.shape[1])
 
 
 def _size(uncertainty: Uncertainty, n: int | None) -> int:

@@ -11,6 +11,8 @@ from __future__ import annotations
 import logging
 import multiprocessing
 import os
+import signal
+import socket
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import (
     BrokenExecutor,
@@ -134,7 +136,9 @@ def executor_for(workers: int = 1, cluster: str = "") -> Iterator[Executor | Non
     # not copies of this one, cannot inherit a lock that one of its threads holds.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     fresh = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, mp_context=fresh) as pool:
+    # Ctrl-C in a terminal reaches all processes; this one decides what it means.
+    ignore = signal.signal, (signal.SIGINT, signal.SIG_IGN)
+    with ProcessPoolExecutor(workers, fresh, *ignore) as pool:
         yield pool
 
 
@@ -146,5 +150,23 @@ def _dask_executor(address: str) -> Iterator[Executor]:
         raise ValueError(
             "a cluster needs Dask: pip install 'nmss-lab[cluster]'"
         ) from error
+    _call(address)
     with Client(address, timeout="10s") as client:  # type: ignore[no-untyped-call]
         yield client.get_executor()
+
+
+def _call(address: str) -> None:
+    """See whether anybody answers at all: Dask would try for ten seconds.
+
+    A client of Dask that has not found its scheduler also holds up the end of the
+    process, and complains.
+    """
+    from distributed.comm.addressing import get_address_host_port
+
+    place = get_address_host_port(address)
+    try:
+        socket.create_connection(place, timeout=10.0).close()
+    except OSError as error:
+        raise OSError(
+            f"no scheduler answers at {address}: {error.strerror or error}"
+        ) from error

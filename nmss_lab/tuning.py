@@ -11,8 +11,10 @@ every goal is more than reached.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
+from contextlib import closing
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Literal
@@ -25,7 +27,7 @@ from nmss_lab.controller import Controller
 from nmss_lab.design import Design
 from nmss_lab.measures import measures, steps, violations
 from nmss_lab.models import Array, DifferenceModel, LinearPlant
-from nmss_lab.parallel import all_of
+from nmss_lab.parallel import in_order
 from nmss_lab.simulate import Run, Scenario, closed_loop, closed_loops
 from nmss_lab.weights import Weights
 
@@ -335,17 +337,26 @@ def _objectives(
         return [linear_loop(controller, plant).radius for plant in trial.all_plants]
     if isinstance(goal.objective, str):
         of = OBJECTIVES[goal.objective]
-        return [of(run, goal.channel) for run in runs]
+        return [
+            float("nan") if np.isnan(run.y).any() else of(run, goal.channel)
+            for run in runs  # what a loop did before it was given up tells nothing
+        ]
     return [float(goal.objective(run)) for run in runs]
 
 
 def _summed_up(goal: Goal, values: Sequence[float]) -> float:
     """Make one number of the objective of many runs."""
-    if not np.isfinite(values).all():
-        return float("nan")
+    found = np.array(values, dtype=float)
+    told = np.isfinite(found)
     if goal.over == "mean":
-        return float(np.mean(values))
-    return float(np.quantile(values, goal.over))
+        return float(found.mean()) if told.all() else float("nan")
+    if told.all():
+        return float(np.quantile(found, goal.over))
+    # What cannot be told counts as worst, and nothing is interpolated towards it.
+    place = float(
+        np.quantile(np.where(told, found, np.inf), goal.over, method="higher")
+    )
+    return place if np.isfinite(place) else float("nan")
 
 
 @dataclass(frozen=True, eq=False)
@@ -420,7 +431,7 @@ def tune(
         design cannot be run.
     """
     goals, trials = tuple(goals), tuple(trials)
-    _check(goals, trials, starts)
+    _check(goals, trials, starts, evaluations)
     weights = weights or Weights(design)
     before = evaluate(design, goals, trials)
     search = _Search(
@@ -514,7 +525,9 @@ def _beats(one: Tuned, other: Tuned) -> bool:
     return bool((a <= b).all() and (a < b).any())
 
 
-def _check(goals: Sequence[Goal], trials: Sequence[Trial], starts: int) -> None:
+def _check(
+    goals: Sequence[Goal], trials: Sequence[Trial], starts: int, evaluations: int
+) -> None:
     if not any(not goal.is_hard for goal in goals):
         raise ValueError(
             "goals has no soft goal: give one at least an importance above 0, it is "
@@ -527,6 +540,8 @@ def _check(goals: Sequence[Goal], trials: Sequence[Trial], starts: int) -> None:
             )
     if starts < 1:
         raise ValueError(f"starts = {starts}: expected at least 1")
+    if evaluations < 1:
+        raise ValueError(f"evaluations = {evaluations}: expected at least 1")
 
 
 @dataclass(eq=False)
@@ -575,6 +590,8 @@ class _Search:
             self.polish()
         except _StopSearchError as reason:
             return str(reason)
+        if not np.isfinite(self.best.values).all():
+            return "No design that was tried has a finite value for every goal."
         return "The search has converged from every start."
 
     def values_of(self, vectors: Sequence[Array]) -> list[Array]:
@@ -585,11 +602,12 @@ class _Search:
             for key, vector in zip(keys, vectors, strict=True)
             if key not in self.known
         }
+        new = dict(itertools.islice(new.items(), self.limit - self.count))
         tasks = [(self.problem, vector) for vector in new.values()]
-        found = all_of(_evaluated, tasks, self.executor)
-        for (key, vector), values in zip(new.items(), found, strict=True):
-            self.known[key] = values
-            self._note(vector, values)
+        with closing(in_order(_evaluated, tasks, self.executor)) as found:
+            for (key, vector), values in zip(new.items(), found, strict=True):
+                self.known[key] = values
+                self._note(vector, values)
         if self.count >= self.limit:
             raise _StopSearchError(
                 f"The search has tried {self.count} designs, as allowed."

@@ -266,6 +266,9 @@ class Intervals:
     def draw(self, i: int, rng: np.random.Generator) -> Draw:
         """Draw each parameter, or take corner number ``i``."""
         if self.corners:
+            count = 2 ** len(self.intervals)
+            if not 0 <= i < count:
+                raise ValueError(f"corner {i}: expected one from 0 to {count - 1}")
             sides = itertools.product(*self.intervals.values())
             drawn = next(itertools.islice(sides, i, None))
         else:

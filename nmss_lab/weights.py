@@ -10,12 +10,11 @@ import dataclasses
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
 from nmss_lab.design import Design
-from nmss_lab.models import Array
+from nmss_lab.models import Array, DifferenceModel
 from nmss_lab.mpc import state_weight
 from nmss_lab.pip import lq_gain
 from nmss_lab.qp import weight
@@ -125,14 +124,21 @@ class Weights:
         return self.design.structure in WITH_STATE
 
     @property
-    def _model(self) -> Any:
-        """Model with the sizes of the state."""
+    def _model(self) -> DifferenceModel:
+        """Model with the sizes of the state that is weighed.
+
+        A state-dependent model remembers what its coefficients read as well, but that
+        has no weight.
+        """
         model = self.design.model
-        return getattr(model, "wide", model)
+        if isinstance(model, DifferenceModel):
+            return model
+        past_y = np.zeros((model.na, model.n_y, model.n_y))
+        return model.model_of(past_y, np.zeros((model.nb, model.n_y, model.n_u)))
 
     @property
     def _nb(self) -> int:
-        return int(self._model.nb)
+        return self._model.nb
 
     @cached_property
     def blocks(self) -> tuple[Block, ...]:
@@ -211,7 +217,9 @@ class Weights:
             K = lq_gain(self._model, Q, R)
             options = {**self.design.options, "K": K}
             return dataclasses.replace(self.design, options=options, Q=Q, R=R)
-        return dataclasses.replace(self.design, Q=Q, R=R)
+        # The gain of a state-dependent PIP is that of the weights, not of given poles.
+        options = {k: v for k, v in self.design.options.items() if k != "poles"}
+        return dataclasses.replace(self.design, options=options, Q=Q, R=R)
 
     def _state(self, *parts: Array) -> Array:
         return state_weight(self._model, *parts)
