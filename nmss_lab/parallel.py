@@ -16,6 +16,7 @@ import socket
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import (
     BrokenExecutor,
+    CancelledError,
     Executor,
     Future,
     ProcessPoolExecutor,
@@ -56,6 +57,8 @@ def each(
 
     Raises
     ------
+    ConnectionError
+        If the executor withdraws tasks, such as when its cluster goes away.
     Exception
         Whatever the function raises.
     """
@@ -75,6 +78,11 @@ def each(
     except BrokenExecutor as error:
         LOG.warning("The pool of workers broke (%s); going on in one process.", error)
         yield from ((i, function(tasks[i])) for i in sorted(owed))
+    except CancelledError as error:
+        raise ConnectionError(
+            f"{len(owed)} of {len(tasks)} tasks were withdrawn: the executor was shut "
+            "down, or its cluster went away"
+        ) from error
     finally:
         for future in futures:
             future.cancel()

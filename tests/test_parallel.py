@@ -183,6 +183,18 @@ def test_closing_withdraws_tasks(of: Callable[..., Iterator]) -> None:
     assert len(begun) <= 2  # the one that was asked for and the one then running
 
 
+def test_an_executor_that_goes_away_is_told() -> None:
+    """Whoever waits learns that tasks were withdrawn, and how many."""
+    hold = threading.Event()
+    with ThreadPoolExecutor(1) as threads:
+        results = each(lambda wait: hold.wait(60) if wait else True, [0, 1, 1], threads)
+        assert next(results) == (0, True)
+        threading.Timer(0.1, hold.set).start()
+        threads.shutdown(cancel_futures=True)
+        with pytest.raises(ConnectionError, match=r"of 3 tasks were withdrawn"):
+            list(results)
+
+
 def test_closing_a_study_withdraws_its_parts() -> None:
     """The same through the generator of a study."""
     begun = []
