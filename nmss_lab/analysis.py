@@ -282,6 +282,7 @@ def review(
     if isinstance(controller, PredictiveController):
         findings += [_conditioning(controller), _dead_time(controller)]
         findings += _rows_left_out(controller) + _sum_of_error(controller)
+        findings += _terminal(controller)
     findings += _conflicts(controller)
     findings += _hidden(loop)
     return Review(tuple(findings))
@@ -405,6 +406,24 @@ def _rows_left_out(controller: PredictiveController) -> list[Finding]:
     more = f" and {len(rows) - 4} more" if len(rows) > 4 else ""
     sentence = f"No decision moves {listed}{more}: these limits are not promised."
     return [Finding("limits", "note", sentence)]
+
+
+def _terminal(controller: PredictiveController) -> list[Finding]:
+    """Terminal equalities that the free moves cannot meet."""
+    program = controller.program
+    rows = program.rows.get("terminal", np.zeros(0, dtype=int))
+    if not len(rows):
+        return []
+    both = np.hstack([program.M[rows], program.offset[rows]])
+    met, asked = (int(np.linalg.matrix_rank(part)) for part in (program.M[rows], both))
+    if met == asked:
+        return []
+    sentence = (
+        f"The terminal equality has {asked} conditions, of which the free moves can "
+        f"meet {met}: at most samples it is dropped, and the poles are those without "
+        "it. Lengthen Nc, and Np with it."
+    )
+    return [Finding("terminal", "bad", sentence)]
 
 
 def _conflicts(controller: Controller) -> list[Finding]:

@@ -148,7 +148,8 @@ _SENTENCES = {
     Status.FREE: "No limit is active: the linear law was applied.",
     Status.LIMITED: "A limit is active in the plan: the quadratic program was solved.",
     Status.SOFTENED: "Limits could not all be kept: some were relaxed.",
-    Status.DROPPED: "Output limits could not be kept: they were dropped this sample.",
+    Status.DROPPED: "Output limits (or the terminal equality) could not be kept: they "
+    "were dropped this sample.",
     Status.CLIPPED: "The law asked for more than the input can do: it was clipped.",
     Status.REFUSED: "A measurement was not a number: its prediction stood in for it.",
     Status.SHIFTED: "The solver failed: the last plan was continued and clipped.",

@@ -281,6 +281,17 @@ def test_review_sees_a_horizon_that_ends_in_the_dead_time():
     assert "horizon" in topics(review(wang_young(late, Horizon(5, 2), 1, 0.1)), "good")
 
 
+@pytest.mark.parametrize(("moves", "is_said"), [(3, True), (4, False)])
+def test_review_says_when_a_terminal_equality_cannot_be_met(moves, is_said):
+    """Plant (6.10) needs four conditions, so three moves are too few."""
+    model = DifferenceModel([-1.7, 1.0], [-1.0, 2.0])
+    horizon = Horizon(moves, moves)
+    design = wang_young(model, horizon, 1.0, 1.0, terminal="equality")
+    found = [f for f in review(design).findings if f.topic == "terminal"]
+    assert bool(found) == is_said
+    assert all("4 conditions" in f.sentence and "meet 3" in f.sentence for f in found)
+
+
 def test_review_finds_limits_that_contradict_each_other():
     """An output that no allowed input can hold, in the output's unit."""
     model = DifferenceModel([-0.9], [0.1], units={"y1": "degC"})

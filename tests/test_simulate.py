@@ -627,6 +627,14 @@ def test_limits_that_give_way_do_so_in_an_ensemble_too(outputs):
         assert shared_share(runs) > 0.1
 
 
+def test_a_start_may_be_a_plain_number():
+    """As for a state-dependent plant: one number stands for every output."""
+    model = DifferenceModel([-0.5], [0.5])
+    controller = wang_young(model, Horizon(5, 2), 1.0, 1.0)
+    run = closed_loop(model, controller, Scenario(np.ones(4), y0=1.0, u0=1.0))
+    assert np.allclose(run.y, 1.0)  # at rest from the start
+
+
 def test_input_outside_its_limits_has_bounds_of_its_own_in_an_ensemble():
     """They are wider there, so that no region fits; afterwards regions do."""
     controller = build("wang_young", LIMITS)
