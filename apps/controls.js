@@ -216,7 +216,7 @@ export function render({ model, el }) {
 
   const needed = () => {
     for (const { name, when } of model.form.groups.flatMap((group) => group.items)) {
-      const idle = when && values[when[0]] !== when[1]
+      const idle = when && ![when[1]].flat().includes(values[when[0]])
       form.querySelector(`[data-name="${name}"]`).classList.toggle("idle", Boolean(idle))
     }
   }

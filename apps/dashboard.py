@@ -7,7 +7,14 @@ from collections.abc import Callable
 import panel as pn
 from panel.viewable import Viewable
 
-from apps.pages import governor, identify, receding_horizon, state_dependent
+from apps.pages import (
+    governor,
+    identify,
+    receding_horizon,
+    robustness,
+    state_dependent,
+    tune,
+)
 from apps.pages.live import Subject, page_template, text_style
 from apps.session import known_case
 from nmss_lab.cases import CASES
@@ -28,9 +35,15 @@ every limit.</a>
 <a class="card" href="identify"><b>Identify</b>
 From a record, shipped or your own, to a ranked table of models with honest
 uncertainty, and from there to a controller.</a>
+<a class="card" href="tune"><b>Tune</b>
+Say what the loop should become, goal by goal, and watch what can be attained and at
+what price.</a>
 <a class="card" href="state_dependent"><b>State-dependent control</b>
 Plants whose coefficients move with the plan: watch predictions settle, swing or run
 away, over time and pass by pass within one sample, beside the true optimum.</a>
+<a class="card" href="robustness"><b>Robustness</b>
+How the loop behaves for the plants one does not have: thousands of them, their poles,
+bands and rates, how often and how badly, and each one to look into.</a>
 </div>
 <h2>Start from an example</h2>
 """
@@ -74,5 +87,7 @@ def pages() -> dict[str, Callable[[], Viewable]]:
         "receding_horizon": receding_horizon.page,
         "governor": governor.page,
         "identify": identify.page,
+        "tune": tune.page,
         "state_dependent": state_dependent.page,
+        "robustness": robustness.page,
     }

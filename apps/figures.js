@@ -58,3 +58,29 @@ const recolour = (plot, colors) => {
   }
 }
 
+// What the server hands over: ``saved`` is a file to keep, ``leads`` an address to open.
+const handOver = (model) => {
+  model.on("saved", () => {
+    const { name, text } = model.saved
+    const link = element("a", { download: name })
+    link.href = URL.createObjectURL(new Blob([text], { type: "application/json" }))
+    link.click()
+    setTimeout(() => URL.revokeObjectURL(link.href), 1000)
+  })
+  model.on("leads", () => location.assign(model.leads.to))
+}
+
+// Figures in the colours of the page, now and whenever they change; ``ready`` is called
+// when as many as there should be are there.
+const followTheme = (model, count, ready) => {
+  const colour = () => {
+    const colors = colorsNow()
+    const views = Object.values(figureViews())
+    if (views.length < count()) { setTimeout(colour, 60); return }
+    for (const view of views) recolour(view.model, colors)
+    ready()
+  }
+  window.addEventListener("nmss-theme", colour)
+  model.on("remove", () => window.removeEventListener("nmss-theme", colour))
+  colour()
+}

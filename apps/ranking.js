@@ -109,29 +109,15 @@ export function render({ model, el }) {
     empty.hidden = !hint
   }
 
-  const colour = () => {
-    const colors = colorsNow()
-    const views = Object.values(figureViews())
-    if (views.length < model.figures) { setTimeout(colour, 60); return }
-    for (const view of views) recolour(view.model, colors)
-    window.nmssIdentify = Object.assign(statistics, {
-      rows: () => model.rows.length, running: () => model.progress.running,
-    })
-  }
-  window.addEventListener("nmss-theme", colour)
-  model.on("remove", () => window.removeEventListener("nmss-theme", colour))
   model.on("rows", fill)
   model.on("chosen", fill)
   model.on("progress", progress)
-  model.on("saved", () => {
-    const { name, text } = model.saved
-    const link = element("a", { download: name })
-    link.href = URL.createObjectURL(new Blob([text], { type: "application/json" }))
-    link.click()
-    setTimeout(() => URL.revokeObjectURL(link.href), 1000)
-  })
-  model.on("leads", () => location.assign(model.leads.to))
+  handOver(model)
   fill()
   progress()
-  colour()
+  followTheme(model, () => model.figures, () => {
+    window.nmssIdentify = Object.assign(statistics, {
+      rows: () => model.rows.length, running: () => model.progress.running,
+    })
+  })
 }

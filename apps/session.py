@@ -117,6 +117,8 @@ def plain(name: str) -> str:
         "sdp_pip": "PIP, gain per sample",
         "sdp_pip_naive": "PIP, naive increments",
         "sdp_governor": "PIP with governor",
+        "tuned": "Tuned",
+        "before": "Before tuning",
     }
     scheme = name.removeprefix("integral_")
     if scheme in ("frozen", "iterated", "gauss_newton", "newton") and scheme != name:
@@ -128,7 +130,8 @@ class Form(param.Parameterized):
     """Choices that a form shows: labels, help, bounds, groups."""
 
     scale: ClassVar[dict[str, str]] = {}
-    when: ClassVar[dict[str, tuple[str, str]]] = {}
+    when: ClassVar[dict[str, tuple[str, Any]]] = {}
+    """For a choice, another one and the value, or values, with which it counts."""
     groups: ClassVar[dict[str, tuple[str, ...]]] = {}
     fields: ClassVar[tuple[str, ...]] = ()
     """Numbers that are typed."""
@@ -293,7 +296,7 @@ class Choices(Form):
     )
 
     scale: ClassVar[dict[str, str]] = {"u_max": "log", "du_max": "log", "y_max": "log"}
-    when: ClassVar[dict[str, tuple[str, str]]] = {
+    when: ClassVar[dict[str, tuple[str, Any]]] = {
         f"{key}_max": (f"limit_{key}", "own") for key in ("u", "du", "y")
     }
     groups: ClassVar[dict[str, tuple[str, ...]]] = {}
@@ -384,8 +387,11 @@ class Choices(Form):
 
     def _shown(self, key: str) -> bool:
         model = self.example.model
+        drawn = self.case.startswith("drawn-")  # its plant is one of a kind
         return not (
-            (key == "output" and model.n_y == 1) or (key == "input" and model.n_u == 1)
+            (key == "output" and model.n_y == 1)
+            or (key == "input" and model.n_u == 1)
+            or (key == "dynamics" and drawn)
         )
 
     def _item(self, key: str) -> dict[str, Any]:
@@ -682,6 +688,7 @@ class LoopChoices(DesignChoices):
         """Choose the horizons; weights given along the horizon keep theirs."""
         single = design.model.n_y == 1
         along = single and np.ndim(design.Q) == 1 and np.size(design.Q) > 1
+        along = along or 3 in (np.ndim(design.Q), np.ndim(design.R))
         return design.horizon if along else Horizon(self.Np, self.Nc)
 
     def _horizon_lines(self) -> tuple[list[str], str]:
@@ -698,13 +705,18 @@ class LoopChoices(DesignChoices):
         return [f"own = {{{own}}}"], f"own.get(name, {chosen})"
 
     def _design_lines(self) -> list[str]:
+        loop = "closed_loop(plant, design.build(), scenario)"
+        return self._lines_for_designs("runs", loop)
+
+    def _lines_for_designs(self, collected: str, value: str) -> list[str]:
+        """Lines that make each ``design`` and collect a value of it by its name."""
         before, horizon = self._horizon_lines()
         reading = (
             [] if self.reading == "case" else [f'        reference="{self.reading}",']
         )
         return [
             *before,
-            "runs = {}",
+            f"{collected} = {{}}",
             f"for name in {list(self.structures)!r}:",
             "    design = example.designs[name]",
             "    limits = design.limits",
@@ -717,7 +729,7 @@ class LoopChoices(DesignChoices):
             "        limits=limits,",
             *reading,
             "    )",
-            "    runs[name] = closed_loop(plant, design.build(), scenario)",
+            f"    {collected}[name] = {value}",
         ]
 
 
@@ -758,7 +770,7 @@ class GovernorChoices(Choices):
         doc="Larger steps of r bring the loop closer to its limits.",
     )
 
-    when: ClassVar[dict[str, tuple[str, str]]] = {
+    when: ClassVar[dict[str, tuple[str, Any]]] = {
         **Choices.when,
         "free_until": ("reading", "zero after step s"),
         "decay": ("reading", "decaying"),

@@ -36,6 +36,23 @@ def serve() -> tuple[subprocess.Popen[str], str]:
     return process, found[0]
 
 
+def robustness(page: Page, url: str) -> None:
+    """Open the study that the page begins with, and wait for all of it."""
+    page.goto(f"{url}robustness")
+    page.wait_for_function("window.nmssStudy?.shown() === 300", timeout=60_000)
+
+
+def tune(page: Page, url: str) -> None:
+    """Tune the example that the page begins with."""
+    page.goto(f"{url}tune")
+    page.get_by_role("button", name="Tune", exact=True).click()
+    page.wait_for_function("window.nmssTune?.finished === 1", timeout=120_000)
+
+
+STUDIES = {"robustness": robustness, "tune": tune}
+"""Pages whose picture is that of finished work."""
+
+
 def take(page: Page, url: str, name: str) -> None:
     """Open a page, play it to the chosen sample, and keep the picture."""
     choices, sample, past = VIEWS[name]
@@ -63,6 +80,10 @@ def main() -> None:
             page = browser.new_page(viewport={"width": 1440, "height": 900})
             for name in VIEWS:
                 take(page, url, name)
+            for name, make in STUDIES.items():
+                make(page, url)
+                page.wait_for_timeout(1000)
+                page.screenshot(path=HERE / f"{name}.png")
             browser.close()
     finally:
         process.terminate()

@@ -27,6 +27,7 @@ from bokeh.models import (
     Legend,
     Range1d,
     Span,
+    TapTool,
 )
 from bokeh.plotting import figure
 
@@ -34,6 +35,7 @@ from nmss_lab.controller import Status
 from nmss_lab.convergence import Best, Iterate
 from nmss_lab.identify import Estimate, pole_draws, step_band, step_response
 from nmss_lab.models import Array
+from nmss_lab.montecarlo import MonteCarlo
 from nmss_lab.predictive import PredictiveController
 from nmss_lab.records import Record
 from nmss_lab.simulate import Run
@@ -595,6 +597,42 @@ def estimate_charts(
     ]
 
 
+# Tuning
+
+
+def history_chart(found: Sequence[tuple[int, float]], tried: int) -> Chart:
+    """Chart of the best attainment factor against the number of designs tried.
+
+    Parameters
+    ----------
+    found : sequence of (int, float)
+        Designs tried at each improvement, and the attainment factor from then on.
+    tried : int
+        Designs tried so far.
+
+    Returns
+    -------
+    Chart
+        Named "history".  Factors that hard goals make huge are drawn at the upper end.
+    """
+    finite = [(n, a) for n, a in found if np.isfinite(a)]
+    last = finite[-1][1] if finite else 0.0
+    top = max(1.0, 3.0 * abs(last))
+    counts = np.array([*(float(n) for n, _ in finite), float(tried)])
+    values = np.array([*(min(a, top) for _, a in finite), min(last, top)])
+    ends = np.array([0.0, max(float(tried), 10.0)])
+    return Chart(
+        "history",
+        "Best attainment factor so far",
+        "attainment [-]",
+        (Curve("best so far", counts, values, True, 1),) if finite else (),
+        (Curve("every goal met", ends, np.zeros(2)),),
+        samples=ends,
+        unit="-",
+        across="designs tried",
+    )
+
+
 def _check_estimates(estimates: Mapping[str, Estimate]) -> None:
     if len(estimates) > len(STYLES):
         raise ValueError(f"{len(estimates)} estimates: expected up to {len(STYLES)}")
@@ -735,7 +773,11 @@ def _sides(run: Run, signal: Any, channel: int) -> tuple[float, float]:
 
 def time_unit(run: Run) -> tuple[float, str]:
     """Choose a unit of time for the length of a run: its seconds, and its name."""
-    seconds = float(run.t[-1])
+    return unit_of_time(float(run.t[-1]))
+
+
+def unit_of_time(seconds: float) -> tuple[float, str]:
+    """Choose a unit for a length of time: its seconds, and its name."""
     units = ((86400.0, "d"), (3600.0, "h"), (60.0, "min"))
     fitting = [unit for unit in units if seconds >= 8.0 * unit[0]]
     return fitting[0] if fitting else (1.0, "s")
@@ -1034,7 +1076,7 @@ class EstimateFigure(ChartFigure):
     """A figure that also draws bands about curves, and curves as points."""
 
     def __init__(self, chart: Chart, times: Range1d | None = None) -> None:
-        columns = ("t", "low", "high"), ("t", "y", "size")
+        columns = ("t", "low", "high"), ("t", "y", "size", "number")
         self.bands, self.points = (
             [ColumnDataSource({key: [] for key in keys}) for _ in STYLES]
             for keys in columns
@@ -1067,9 +1109,16 @@ def _band_columns(curve: Curve | None) -> dict[str, Array]:
 
 def _point_columns(curve: Curve | None) -> dict[str, Array]:
     if curve is None or not curve.marks:
-        return {key: np.zeros(0) for key in ("t", "y", "size")}
+        return {key: np.zeros(0) for key in ("t", "y", "size", "number")}
+    if isinstance(curve, Cloud):
+        number = curve.numbers
+        t, y = (part.astype(np.float32) for part in (curve.t, curve.values))
+        numbers = np.full(len(t), -1) if number is None else number
+        size = np.full(len(t), 4.0, np.float32)
+        return {"t": t, "y": y, "size": size, "number": numbers.astype(np.int32)}
     size = np.where(np.arange(len(curve.t)) < curve.marks, 12.0, 3.0)
-    return {"t": curve.t, "y": curve.values, "size": size}
+    number = np.full(len(size), -1)
+    return {"t": curve.t, "y": curve.values, "size": size, "number": number}
 
 
 def _add_band(plot: figure, source: ColumnDataSource, number: int) -> None:
@@ -1191,3 +1240,411 @@ def _add_legend(plot: figure, chart: Chart) -> None:
     lines = plot.renderers[: len(STYLES)]
     items = [(curve.label, [lines[curve.style]]) for curve in chart.curves]
     plot.add_layout(Legend(items=items, location="top_right"))
+
+
+# Ensembles: many realisations of the plant at once
+
+
+MOST_POLES = 3000
+"""Poles of one design that are drawn, apart from those at the origin."""
+
+ORIGIN = 1e-3
+"""Poles nearer than this to the origin are drawn once, as nominal ones."""
+
+ALWAYS = 30
+"""Worst realisations whose poles are drawn whatever their number."""
+
+FARTHEST = 3.0
+"""Poles beyond this radius lie outside the picture."""
+
+
+@dataclass(frozen=True, eq=False)
+class Cloud(Curve):
+    """A curve that stands for many realisations.
+
+    Parameters
+    ----------
+    nominal : array (M,), optional
+        The same with the nominal plant, a thin line.
+    crosses : complex array, optional
+        Places of the nominal poles.
+    numbers : array (M,), optional
+        Numbers of the realisations of points, so that they can be picked.
+    """
+
+    nominal: Array | None = None
+    crosses: Any = None
+    numbers: Array | None = None
+
+    @property
+    def reach(self) -> Array:
+        """Values about the nominal ones; loops that run away do not flatten them."""
+        if self.nominal is None:
+            near: Array = self.values[np.abs(self.values) <= FARTHEST]
+            return near
+        core = self.nominal[np.isfinite(self.nominal)]
+        low, high = _room(core)
+        parts = [p for p in (self.values, self.low, self.high) if p is not None]
+        shown = np.concatenate([core, *parts])
+        return np.clip(shown[~np.isnan(shown)], low, high)
+
+
+def _room(core: Array) -> tuple[float, float]:
+    size = float(np.ptp(core)) or 1.0
+    return float(core.min()) - size, float(core.max()) + size
+
+
+def ensemble_charts(
+    study: MonteCarlo,
+    nominal: Mapping[str, Run],
+    poles: Mapping[str, Any],
+    output: int = 0,
+    input: int = 0,
+    measure: str = "IAE",
+) -> list[Chart]:
+    """Charts of a study: pole clouds, bands of output and input, a distribution.
+
+    Parameters
+    ----------
+    study : MonteCarlo
+        With signals, of up to three designs.
+    nominal : mapping of str to Run
+        Each design's run on the nominal plant.
+    poles : mapping of str to complex array
+        Closed-loop poles with it.
+    output, input : int
+        Which channels are shown.
+    measure : str
+        Column of the table.
+
+    Returns
+    -------
+    list of Chart
+        Named "poles", "output", "input" and "distribution".
+
+    Raises
+    ------
+    ValueError
+        As ``loop_charts``.
+    """
+    first = _check(nominal, output, input)
+    model = first.controller.model
+    y, u = model.y_names[output], model.u_names[input]
+    in_y, in_u = (_unit(model.units.get(name, "")) for name in (y, u))
+    bands = "median and 95 % band"
+    response = Chart(
+        "output",
+        f"Output: {bands}",
+        f"{y}{in_y}",
+        _band_clouds(study, nominal, "y", output),
+        (Curve("reference r", first.t, first.r[:, output], held=True),),
+        _sides(first, "y", output),
+    )
+    moves = Chart(
+        "input",
+        f"Input: {bands}",
+        f"{u}{in_u}",
+        _band_clouds(study, nominal, "u", input),
+        limits=_sides(first, "u", input),
+    )
+    return [
+        cloud_chart(study, poles),
+        _timed(response, first),
+        _timed(moves, first),
+        distribution_chart(study, measure, y, first),
+    ]
+
+
+def _band_clouds(
+    study: MonteCarlo, nominal: Mapping[str, Run], signal: str, channel: int
+) -> tuple[Cloud, ...]:
+    clouds = []
+    for style, (name, run) in enumerate(nominal.items()):
+        kept = study.signals[name]
+        if signal == "u":  # bands of u are found as those of y
+            kept = dataclasses.replace(kept, y=kept.u)
+        alone = getattr(run, signal)[:, channel]
+        far = 50.0 * max(float(np.ptp(alone[np.isfinite(alone)])), 1e-9)
+        low, middle, high = np.clip(kept.band()[:, :, channel], -far, far)
+        every = slice(None, None, max(1, len(run.t) // DRAWN_POINTS))
+        parts = (run.t, middle, low, high, np.clip(alone, -far, far))
+        t, middle, low, high, alone = (part[every] for part in parts)
+        clouds.append(
+            Cloud(name, t, middle, style=style, low=low, high=high, nominal=alone)
+        )
+    return tuple(clouds)
+
+
+def cloud_chart(study: MonteCarlo, poles: Mapping[str, Any]) -> Chart:
+    """Chart of the closed-loop poles of all realisations, or of as many as one sees."""
+    clouds, shown = [], len(study)
+    for style, (name, drawn) in enumerate(study.poles.items()):
+        there = np.abs(drawn) > ORIGIN
+        rows = _rows_shown(drawn, there)
+        shown = min(shown, len(rows))
+        p, there = drawn[rows].ravel(), there[rows].ravel()
+        numbers = np.repeat(study.realisations[rows], drawn.shape[1])
+        clouds.append(
+            _pole_cloud(name, p[there], numbers[there], style, poles.get(name))
+        )
+    of = f"{len(study):,} realisations"
+    of = of if shown == len(study) else f"{shown:,} of {of}"
+    return _z_plane(f"Poles, {of}", clouds)
+
+
+def _rows_shown(poles: Array, there: Array) -> Array:
+    """Rows of the poles that are drawn: the first ones, and the worst."""
+    most = max(int(MOST_POLES / max(there.sum(axis=1).mean(), 1.0)), ALWAYS)
+    if len(poles) <= most + ALWAYS:
+        return np.arange(len(poles))
+    radii = np.nan_to_num(np.abs(poles)).max(axis=1)
+    worst = np.argsort(radii)[-ALWAYS:]
+    rows: Array = np.union1d(np.arange(most), worst)
+    return rows
+
+
+def _pole_cloud(
+    name: str, poles: Any, numbers: Array | None, style: int, crosses: Any
+) -> Cloud:
+    return Cloud(
+        name,
+        poles.real,
+        poles.imag,
+        style=style,
+        marks=1,
+        crosses=crosses,
+        numbers=numbers,
+    )
+
+
+def _z_plane(title: str, clouds: Sequence[Cloud]) -> Chart:
+    """Chart of points about the unit circle."""
+    radii = [np.abs(c.t + 1j * c.values) for c in clouds]
+    far = max((float(r[r <= FARTHEST].max(initial=0.0)) for r in radii), default=0.0)
+    half = max(1.1, 1.05 * far)
+    angle = np.linspace(0.0, 2.0 * np.pi, 361)
+    circle = Curve("unit circle", np.cos(angle), np.sin(angle))
+    return Chart(
+        "poles",
+        title,
+        "imaginary part [-]",
+        tuple(clouds),
+        (circle,),
+        samples=np.array([-half, half]),
+        unit="-",
+        across="real part",
+    )
+
+
+def locus_chart(loci: Mapping[str, Array], poles: Mapping[str, Any], of: str) -> Chart:
+    """Chart of the poles while one factor walks.
+
+    Parameters
+    ----------
+    loci : mapping of str to array (n, n_poles)
+        Poles for each factor, by design.
+    poles : mapping of str to complex array
+        Poles where the factor is at its bounds, as crosses.
+    of : str
+        What is multiplied, and how far.
+    """
+    clouds = [
+        _pole_cloud(name, p[~np.isnan(p)], None, style, poles.get(name))
+        for style, (name, p) in enumerate(
+            (name, np.asarray(locus).ravel()) for name, locus in loci.items()
+        )
+    ]
+    return _z_plane(f"Poles, {of}", clouds)
+
+
+NAMES_OF_MEASURES = {
+    "rise": "rise time [{time}]",
+    "settling": "settling time [{time}]",
+    "overshoot": "overshoot [%]",
+    "radius": "largest pole, modulus [-]",
+    "RMS du": "RMS of du",
+    "excess": "worst excess over a limit",
+    "peak": "peak of abs(y)",
+}
+
+
+def distribution_chart(study: MonteCarlo, measure: str, output: str, run: Run) -> Chart:
+    """Chart of the share of realisations whose measure is at most so large."""
+    seconds, unit = time_unit(run)
+    scale = seconds if measure in ("rise", "settling") else 1.0
+    curves, ends, starts = [], [], []
+    for style, name in enumerate(study.poles):
+        values = ranked(study, name, output, measure)[0] / scale
+        share = np.arange(1.0, len(values) + 1.0) / len(values)
+        inside = np.isfinite(values)
+        x, f = values[inside], share[inside]
+        middle = values[len(values) // 2]
+        if len(x):
+            starts.append(x[0])
+            ends.append(x[-1] if not np.isfinite(middle) else min(x[-1], 4.0 * middle))
+            every = slice(None, None, max(1, len(x) // DRAWN_POINTS))
+            x, f = np.append(x[every], x[-1]), np.append(f[every], f[-1])
+            x, f = np.insert(x, 0, x[0]), np.insert(f, 0, 0.0)
+        curves.append(Curve(name, np.clip(x, -1e30, 1e30), f, style=style))
+    low, high = min(starts, default=0.0), max(ends, default=1.0)
+    room = 0.04 * (high - low) or 0.05 * (1.0 + abs(high))
+    beyond = [
+        f"{100.0 * (1.0 - float(c.values[c.t <= high + room].max(initial=0.0))):.3g} %"
+        for c in curves
+    ]
+    words = NAMES_OF_MEASURES.get(measure, measure)
+    where = f"; beyond: {', '.join(beyond)}" if set(beyond) > {"0 %"} else ""
+    return Chart(
+        "distribution",
+        f"Distribution{where}",
+        "share [-]",
+        tuple(curves),
+        samples=np.array([low - room, high + room]),
+        unit="",
+        across=words.format(time=unit),
+    )
+
+
+def ranked(
+    study: MonteCarlo, design: str, output: str, measure: str
+) -> tuple[Array, Array]:
+    """Values of a measure from the best to the worst, and their realisations.
+
+    What has no value, as a time that never comes, is infinitely bad; equal values are
+    ranked by the largest pole.
+    """
+    table = study.table
+    rows = table[(table["design"] == design) & (table["output"] == output)]
+    values = rows[measure].to_numpy(float)
+    values = np.where(np.isnan(values), np.inf, values)
+    order = np.lexsort((np.nan_to_num(rows["radius"].to_numpy(float)), values))
+    return values[order], rows["realisation"].to_numpy()[order]
+
+
+def picked_charts(
+    study: MonteCarlo,
+    nominal: Mapping[str, Run],
+    number: int,
+    output: int,
+    input: int,
+    measure: str,
+) -> list[Chart]:
+    """Charts of one realisation, to be drawn over those of ``ensemble_charts``."""
+    first = _check(nominal, output, input)
+    place = int(np.flatnonzero(study.realisations == number)[0])
+    rings: list[Curve] = []
+    ys: list[Curve] = []
+    us: list[Curve] = []
+    marks: list[Curve] = []
+    name_y = first.controller.model.y_names[output]
+    seconds, _ = time_unit(first)
+    scale = seconds if measure in ("rise", "settling") else 1.0
+    for style, name in enumerate(nominal):
+        p = study.poles[name][place]
+        p = p[np.abs(p) > ORIGIN]
+        rings.append(_pole_cloud(name, p, None, style, None))
+        kept = study.signals[name]
+        for curves, signal, channel in (
+            (ys, kept.y, output),
+            (us, kept.u, input),
+        ):
+            held = signal is kept.u
+            alone = nominal[name].u if held else nominal[name].y
+            values = _until_far(signal[place, :, channel], alone[:, channel])
+            curves.append(Curve(name, kept.t / seconds, values, held, style))
+        values, numbers = ranked(study, name, name_y, measure)
+        at = int(np.flatnonzero(numbers == number)[0])
+        x = np.array([min(float(values[at]) / scale, 1e30)])
+        share = np.array([(at + 1.0) / len(values)])
+        marks.append(Curve(name, x, share, style=style, marks=1))
+    groups = {"poles": rings, "output": ys, "input": us, "distribution": marks}
+    return [Chart(name, "", "", tuple(curves)) for name, curves in groups.items()]
+
+
+def _until_far(values: Array, nominal: Array) -> Array:
+    """Values as long as they are within the picture or near it; nan afterwards."""
+    low, high = _room(nominal[np.isfinite(nominal)])
+    far = ~((values > 2.0 * low - high) & (values < 2.0 * high - low))
+    values = values.copy()
+    if far.any():
+        values[int(np.argmax(far)) + 1 :] = np.nan
+    return np.clip(values, -1e30, 1e30)
+
+
+class EnsembleFigure(EstimateFigure):
+    """A figure of many realisations, and over them of one that was picked."""
+
+    def __init__(self, chart: Chart, times: Range1d | None = None) -> None:
+        self.thin, self.crosses, self.lines, self.rings = (
+            [ColumnDataSource({"t": [], "y": []}) for _ in STYLES] for _ in range(4)
+        )
+        super().__init__(chart, times)
+        self.clouds = [
+            renderer
+            for renderer in self.figure.renderers
+            if str(renderer.name).startswith("points")
+        ]
+        for cloud in self.clouds:
+            cloud.nonselection_glyph = None  # one that is picked dims no other
+        for number in range(len(STYLES)):
+            self._add_picked(number)
+        self.figure.add_tools(TapTool(renderers=self.clouds))
+        self.figure.add_tools("pan", "wheel_zoom")
+        self.figure.toolbar.active_scroll = None
+
+    def _add_picked(self, number: int) -> None:
+        color = STYLES[number]["color"]
+        thin = self.figure.line(
+            "t", "y", source=self.thin[number], color=color, line_dash=[1, 3], width=1.6
+        )
+        thin.name = f"nominal{number}"
+        crosses = self.figure.scatter(
+            "t",
+            "y",
+            source=self.crosses[number],
+            marker="x",
+            size=12,
+            line_color=color,
+            line_width=2.6,
+        )
+        crosses.name = f"cross{number}"
+        line = self.figure.line(
+            "t", "y", source=self.lines[number], color=color, width=4, line_alpha=0.75
+        )
+        line.name = f"picked{number}"
+        rings = self.figure.scatter(
+            "t",
+            "y",
+            source=self.rings[number],
+            marker=str(STYLES[number]["marker"]),
+            size=14,
+            fill_color=None,
+            line_color=color,
+            line_width=2.4,
+        )
+        rings.name = f"ring{number}"
+
+    def show(self, chart: Chart) -> None:
+        """Draw another chart; a realisation that was picked stays."""
+        super().show(chart)
+        if not chart.unit:
+            self.figure.xaxis.axis_label = chart.across
+        with_style = {curve.style: curve for curve in chart.curves}
+        for style in range(len(STYLES)):
+            curve = with_style.get(style)
+            thin, crosses = None, None
+            if isinstance(curve, Cloud) and curve.nominal is not None:
+                thin = Curve("", curve.t, curve.nominal)
+            if isinstance(curve, Cloud) and curve.crosses is not None:
+                p = np.asarray(curve.crosses)
+                crosses = Curve("", p.real, p.imag)
+            _fill(self.thin[style], thin)
+            _fill(self.crosses[style], crosses)
+
+    def pick(self, chart: Chart | None) -> None:
+        """Draw one realisation over all, or none."""
+        with_style = {c.style: c for c in chart.curves} if chart else {}
+        for style in range(len(STYLES)):
+            curve = with_style.get(style)
+            _fill(self.lines[style], None if curve is None or curve.marks else curve)
+            _fill(self.rings[style], curve if curve and curve.marks else None)

@@ -20,10 +20,10 @@ from bokeh.models import BoxAnnotation, Range1d
 from panel.custom import JSComponent
 
 from apps.identification import LARGEST, LOOK, RECORDS, IdentifyChoices, uploaded
+from apps.pages.background import BackgroundPage
 from apps.pages.live import (
     ADDRESS,
     FAULT,
-    KEPT,
     _complaint,
     _from_address,
     _number,
@@ -80,10 +80,11 @@ class Ranking(JSComponent):
     _stylesheets = (STYLE,)
 
 
-class IdentifyPage:
+class IdentifyPage(BackgroundPage):
     """One session's page: keeps the last good record and ranking."""
 
     def __init__(self) -> None:
+        super().__init__()
         self.choices = IdentifyChoices()
         self.complaint = _from_address(self.choices)  # type: ignore[arg-type]
         self.found: list[Candidate] = []
@@ -93,7 +94,6 @@ class IdentifyPage:
         self.hint = self.note = ""
         self.searched: tuple[Any, ...] = ()
         self.total = 0
-        self.document, self.served = pn.state.curdoc, False
         self.lead, self.alert, self.measures, self.python = (
             _text(name) for name in ("lead", "alert", "measures", "python")
         )
@@ -162,20 +162,6 @@ class IdentifyPage:
             self.choices.accept({"record": sent.get("record")})
         else:
             self.choices.accept(sent)
-
-    def _guard(self, action: Callable[[], None], about: Any) -> bool:
-        """Do something; what is wrong with it becomes the complaint."""
-        try:
-            action()
-        except ValueError as error:
-            self.complaint = f"{error}.\n{KEPT}".replace("..\n", ".\n")
-        except Exception:  # whoever asked waits for an answer, whatever happens
-            LOG.exception("identify %s", about)
-            self.complaint = f"{FAULT}\n{KEPT}"
-        else:
-            self.complaint = ""
-            return True
-        return False
 
     def _take_file(self, event: Any) -> None:
         """Take over an uploaded file, or say what is wrong with it."""
@@ -278,14 +264,6 @@ class IdentifyPage:
         else:
             self._later(lambda: self._finished(stop, found, rows))
 
-    def _later(self, action: Callable[[], None]) -> None:
-        """Do something on the event loop of this session, if it still is there."""
-        document = self.document
-        if document is None:
-            action()
-        elif document.session_context is not None:
-            document.add_next_tick_callback(action)
-
     def _counted(self, stop: threading.Event, done: int) -> None:
         if stop is self.stop and self.search is not None:
             self.note = f"{done} of {self.total}"
@@ -378,10 +356,7 @@ class IdentifyPage:
                 self.figures[chart.name].show(chart)
             self._place()
 
-        if self.served:
-            self._later(paint)
-        else:
-            paint()
+        self._painted(paint)
 
     def _show(self) -> None:
         """Draw the record and the rows chosen, and say what they are."""

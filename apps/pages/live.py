@@ -27,7 +27,9 @@ PAGES = (
     ("receding_horizon", "Receding horizon"),
     ("governor", "Reference governor"),
     ("identify", "Identify"),
+    ("tune", "Tune"),
     ("state_dependent", "State-dependent"),
+    ("robustness", "Robustness"),
 )
 
 PARTS = "lead", "alert", "player", "measures", "python", "notes", "controls"
