@@ -11,6 +11,7 @@ from __future__ import annotations
 import logging
 import multiprocessing
 import os
+import queue
 import signal
 import socket
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
@@ -20,7 +21,6 @@ from concurrent.futures import (
     Executor,
     Future,
     ProcessPoolExecutor,
-    as_completed,
 )
 from contextlib import closing, contextmanager
 from typing import TypeVar
@@ -67,11 +67,15 @@ def each(
         yield from ((i, function(task)) for i, task in enumerate(tasks))
         return
     futures: dict[Future[Result], int] = {}
+    done: queue.SimpleQueue[Future[Result]] = queue.SimpleQueue()
     owed = set(range(len(tasks)))
     try:
         for i, task in enumerate(tasks):
-            futures[executor.submit(function, task)] = i
-        for future in as_completed(futures):
+            future = executor.submit(function, task)
+            futures[future] = i
+            future.add_done_callback(done.put)
+        while owed:  # ``as_completed`` would wait for a withdrawn task for ever
+            future = done.get()
             result = future.result()
             owed.remove(futures[future])
             yield futures[future], result

@@ -13,8 +13,10 @@ import pytest
 from conftest import Server
 from playwright.sync_api import Page
 
-PATHS = ["", "receding_horizon", "governor", "identify"]
-"""The pages of this version; the empty path is the index."""
+from apps.pages.live import PAGES
+
+PATHS = ["", *(path for path, _ in PAGES)]
+"""All pages; the empty path is the index."""
 
 LOADING = {
     "script": "src",

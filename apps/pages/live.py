@@ -72,13 +72,33 @@ class Subject:
     inside: Callable[[Any], tuple[list[Chart], list[Any]]] | None = None
 
 
-class LivePage:
+class WithForm:
+    """A page whose form is described anew whenever its choices become others."""
+
+    choices: Any
+    _forms = 0
+
+    def _form(self) -> dict[str, Any]:
+        choices = self.choices
+        self._forms += 1
+        return {
+            "groups": choices.description(),
+            "defaults": choices.defaults(),
+            "number": self._forms,
+        }
+
+    def _state(self, message: int) -> dict[str, Any]:
+        """Values for the latest form, which the browser waits for."""
+        values = self.choices.values()
+        return {"values": values, "message": message, "form": self._forms}
+
+
+class LivePage(WithForm):
     """One session's page: keeps the last good picture whatever is chosen."""
 
     def __init__(self, subject: Subject) -> None:
         self.subject = subject
         self.choices = subject.choices()
-        self._forms = 0
         self.complaint = _from_address(self.choices)
         self.lead, self.alert, self.measures, self.python, self.notes = (
             _text(name) for name in ("lead", "alert", "measures", "python", "notes")
@@ -167,20 +187,6 @@ class LivePage:
             self.choices.accept({"case": sent.get("case")})
         else:
             self.choices.accept(sent)
-
-    def _form(self) -> dict[str, Any]:
-        choices = self.choices
-        self._forms += 1
-        return {
-            "groups": choices.description(),
-            "defaults": choices.defaults(),
-            "number": self._forms,
-        }
-
-    def _state(self, message: int) -> dict[str, Any]:
-        """Values for the latest form, which the browser waits for."""
-        values = self.choices.values()
-        return {"values": values, "message": message, "form": self._forms}
 
     def _tell(self) -> None:
         """Words around the plots."""

@@ -22,6 +22,7 @@ from panel.custom import JSComponent
 from apps.pages.background import BackgroundPage
 from apps.pages.live import (
     FAULT,
+    WithForm,
     _complaint,
     _from_address,
     _number,
@@ -142,7 +143,7 @@ class Job:
     poles: dict[str, Array]
 
 
-class RobustnessPage(BackgroundPage):
+class RobustnessPage(WithForm, BackgroundPage):
     """One session's page: keeps the last good study."""
 
     def __init__(self) -> None:
@@ -154,7 +155,6 @@ class RobustnessPage(BackgroundPage):
         self.found: MonteCarlo | None = None
         self.done, self.note, self.picked = 0, "", -1
         self.loci: dict[tuple[Any, ...], tuple[dict[str, Array], list[Bounds]]] = {}
-        self._forms = 0
         self.lead, self.alert, self.told, self.python, self.notes = (
             _text(name) for name in ("lead", "alert", "told", "python", "notes")
         )
@@ -651,19 +651,6 @@ class RobustnessPage(BackgroundPage):
             "stale": stale,
             "studied": self.found is not None,
         }
-
-    def _form(self) -> dict[str, Any]:
-        choices = self.choices
-        self._forms += 1
-        return {
-            "groups": choices.description(),
-            "defaults": choices.defaults(),
-            "number": self._forms,
-        }
-
-    def _state(self, message: int) -> dict[str, Any]:
-        values = self.choices.values()
-        return {"values": values, "message": message, "form": self._forms}
 
     def template(self) -> pn.Template:
         """Put the page together."""

@@ -25,6 +25,7 @@ from apps.pages.background import BackgroundPage
 from apps.pages.live import (
     ADDRESS,
     FAULT,
+    WithForm,
     _complaint,
     _from_address,
     _number,
@@ -100,7 +101,7 @@ class Live(NamedTuple):
     values: Mapping[str, float]
 
 
-class TunePage(BackgroundPage):
+class TunePage(WithForm, BackgroundPage):
     """One session's page: keeps the last design and picture that worked."""
 
     def __init__(self) -> None:
@@ -120,7 +121,6 @@ class TunePage(BackgroundPage):
         self.tried, self.matched, self.ended = 0, "", 0
         self.made_for: tuple[Any, ...] = ()
         self.tried_for: tuple[Any, ...] = ()
-        self._forms = 0
         texts = ("lead", "alert", "legend", "weights", "measures", "python")
         self.lead, self.alert, self.legend, self.weights, self.measures, self.python = (
             _text(name) for name in texts
@@ -858,19 +858,6 @@ class TunePage(BackgroundPage):
             f"<table><thead><tr><th>Goal</th><th>At most</th>{head}</tr></thead>"
             f"<tbody>{body}</tbody></table>"
         )
-
-    def _form(self) -> dict[str, Any]:
-        choices = self.choices
-        self._forms += 1
-        return {
-            "groups": choices.description(),
-            "defaults": choices.defaults(),
-            "number": self._forms,
-        }
-
-    def _state(self, message: int) -> dict[str, Any]:
-        values = self.choices.values()
-        return {"values": values, "message": message, "form": self._forms}
 
     def template(self) -> pn.Template:
         """Put the page together."""
