@@ -23,7 +23,7 @@ from nmss_lab.design import VARYING, Design
 from nmss_lab.measures import summary, violations
 from nmss_lab.models import Array, DifferenceModel, LinearPlant
 from nmss_lab.parallel import each
-from nmss_lab.simulate import Run, Scenario, closed_loop, closed_loops
+from nmss_lab.simulate import Run, Scenario, loops_of
 from nmss_lab.uncertainty import Draw, Uncertainty, realisation
 
 if TYPE_CHECKING:  # half a second, which only who makes a study should wait for
@@ -351,7 +351,8 @@ def _part(task: _Task) -> MonteCarlo:
     poles, nominal, signals, kept = {}, {}, {}, {}
     for name, design in task.designs.items():
         controller = design.build()
-        runs = _runs(controller, draws, task.scenario, task.keep == "runs")
+        plants = [each_draw.plant for each_draw in draws]
+        runs = loops_of(plants, controller, task.scenario, task.keep == "runs")
         nominal[name], poles[name] = _poles(controller, design, draws)
         radii = np.nanmax(np.abs(poles[name]), axis=1, initial=0.0)
         radii[np.isnan(poles[name]).all(axis=1)] = np.nan
@@ -385,22 +386,6 @@ def _part(task: _Task) -> MonteCarlo:
         task.asked,
         task.seed,
     )
-
-
-def _runs(
-    controller: Controller, draws: Sequence[Draw], scenario: Scenario, moves: bool
-) -> list[Run]:
-    """Run all plants: in lock step where they are linear and of one size."""
-    plants = [
-        d.plant.plant() if isinstance(d.plant, DifferenceModel) else d.plant
-        for d in draws
-    ]
-    linear = all(isinstance(plant, LinearPlant) for plant in plants)
-    if linear and len({plant.A.shape for plant in plants}) == 1:
-        return closed_loops(plants, controller, scenario, moves)
-    if linear:
-        return [closed_loops([p], controller, scenario, moves)[0] for p in plants]
-    return [closed_loop(plant, controller, scenario) for plant in plants]
 
 
 def _poles(

@@ -290,6 +290,33 @@ def closed_loops(
     return _collect(_Stacked(plants), controller, scenario, keep_moves)
 
 
+def loops_of(
+    plants: Sequence[Plant | Equation],
+    controller: Controller,
+    scenario: Scenario,
+    keep_moves: bool = False,
+) -> list[Run]:
+    """Run one controller on plants of any kind and size, in their order.
+
+    Linear ones of equal size run in lock step, see ``closed_loops``; others one by one.
+    """
+    ready = [p.plant() if isinstance(p, DifferenceModel) else p for p in plants]
+    runs: dict[int, Run] = {}
+    alike: dict[tuple[int, ...], list[int]] = {}
+    for i, plant in enumerate(ready):
+        if isinstance(plant, LinearPlant):
+            between = 0 if plant.between is None else len(plant.between.times)
+            size = plant.n_x, plant.n_y, plant.n_u, plant.n_v, between
+            alike.setdefault(size, []).append(i)
+        else:
+            runs[i] = closed_loop(plant, controller, scenario)
+    for numbers in alike.values():
+        linear = [ready[i] for i in numbers]
+        found = closed_loops(linear, controller, scenario, keep_moves)  # type: ignore[arg-type]
+        runs.update(zip(numbers, found, strict=True))
+    return [runs[i] for i in range(len(ready))]
+
+
 def many_loops(
     tasks: Iterable[tuple[Plant | Equation, Controller, Scenario]],
     executor: Executor | None = None,

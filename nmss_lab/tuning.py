@@ -26,9 +26,9 @@ from nmss_lab.analysis import linear_loop
 from nmss_lab.controller import Controller
 from nmss_lab.design import Design
 from nmss_lab.measures import measures, steps, violations
-from nmss_lab.models import Array, DifferenceModel, LinearPlant
+from nmss_lab.models import Array
 from nmss_lab.parallel import in_order
-from nmss_lab.simulate import Run, Scenario, closed_loop, closed_loops
+from nmss_lab.simulate import Run, Scenario, loops_of
 from nmss_lab.weights import Weights
 
 NOT_REACHED = 1e3
@@ -54,10 +54,7 @@ class Trial:
 
     def runs(self, controller: Controller) -> list[Run]:
         """Run the controller on every plant."""
-        plants = self.all_plants
-        if all(isinstance(p, LinearPlant | DifferenceModel) for p in plants):
-            return closed_loops(plants, controller, self.scenario)
-        return [closed_loop(p, controller, self.scenario) for p in plants]
+        return loops_of(self.all_plants, controller, self.scenario)
 
     @property
     def all_plants(self) -> list[Any]:

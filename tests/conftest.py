@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from playwright.sync_api import Browser, Page, sync_playwright
+from playwright.sync_api import Browser, Page, expect, sync_playwright
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -63,7 +63,31 @@ def rng() -> np.random.Generator:
     return np.random.default_rng(20070930)
 
 
+# --- Notebooks --------------------------------------------------------------------
+
+
+class QuietNotebooks:
+    """Lets a cell that nbval runs fail where it writes to standard error."""
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_runtest_call(self, item: pytest.Item) -> Iterator[None]:
+        """Look at what the cell has put out, once it has run."""
+        yield
+        outputs = getattr(item, "test_outputs", None) or []
+        said = [out["text"] for out in outputs if out.get("name") == "stderr"]
+        if said:
+            item.raise_cell_error("Cell wrote to standard error", "".join(said))
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Watch notebooks, too: hooks in this file see only what is beside it."""
+    config.pluginmanager.register(QuietNotebooks())
+
+
 # --- The browser ------------------------------------------------------------------
+
+PATIENCE = 20_000
+"""Milliseconds that a page may take to show what is expected: the machine is shared."""
 
 REQUIRED = os.environ.get("NMSS_REQUIRE_BROWSER", "") == "1"
 NO_BROWSER = (
@@ -126,6 +150,7 @@ def browser(chromium: str) -> Iterator[Browser]:
     loop, which would disturb tests that start one of their own.
     """
     with sync_playwright() as playwright:
+        expect.set_options(timeout=PATIENCE)
         # As root, as in a container, Chromium's sandbox cannot start.
         running = playwright.chromium.launch(
             executable_path=chromium, args=["--no-sandbox"]

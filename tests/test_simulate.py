@@ -17,7 +17,13 @@ from nmss_lab.models import Between, DifferenceModel, LinearPlant
 from nmss_lab.mpc import STRUCTURES, integral_of_error, wang_young
 from nmss_lab.pip import lq_gain, pip, pole_gain
 from nmss_lab.predict import Horizon
-from nmss_lab.simulate import Scenario, closed_loop, closed_loops, samples
+from nmss_lab.simulate import (
+    Scenario,
+    closed_loop,
+    closed_loops,
+    loops_of,
+    samples,
+)
 
 MODEL = DifferenceModel([-1.5, 0.56], [0.1, 0.08], [0.05, 0.02])
 """Stable, with gain 3 from the input and 1.167 from the disturbance."""
@@ -625,6 +631,27 @@ def test_limits_that_give_way_do_so_in_an_ensemble_too(outputs):
         assert solved[told == Status.LIMITED].all()
     else:
         assert shared_share(runs) > 0.1
+
+
+def test_plants_of_any_size_keep_their_order():
+    """Those of equal size run together, and each run is that of its own plant."""
+    model = DifferenceModel([-0.5], [0.5])
+    plants = [model, DifferenceModel([-0.9, 0.2], [0.2, 0.1]), model.varied(1.2)]
+    plants.insert(1, LongWay(model.plant()))
+    controller = wang_young(model, Horizon(5, 2), 1.0, 1.0, Limits(u=(-0.8, 1.1)))
+    scenario = Scenario(np.ones(20))
+    for plant, run in zip(plants, loops_of(plants, controller, scenario), strict=True):
+        alone = closed_loop(plant, controller, scenario)
+        assert np.allclose(run.y, alone.y, atol=1e-8)  # regions against a solver
+
+
+class LongWay:
+    """A plant that is no LinearPlant, though it does the same."""
+
+    def __init__(self, inner):
+        self.inner, self.n_y, self.n_u, self.n_v = inner, 1, 1, 0
+        self.dt, self.reset, self.output = inner.dt, inner.reset, inner.output
+        self.step = inner.step
 
 
 def test_a_start_may_be_a_plain_number():
