@@ -13,15 +13,16 @@ READY := $(VENV)/.ready
 export OPENBLAS_NUM_THREADS ?= 1
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: serve test lint lab clean
+.PHONY: serve test lint lab lessons clean
 
 serve: $(READY)
 	@$(BIN)/nmss-lab serve --port $(PORT)
 
 # One worker per file: cells of a notebook share a kernel, browser tests a server.
+# `notebooks` includes notebooks/solutions.
 test: lint
 	$(BIN)/pytest -n $(WORKERS) --dist loadfile --nbval-lax --nbval-current-env \
-	    tests nmss_lab $(wildcard notebooks)
+	    --nbval-cell-timeout 300 tests nmss_lab notebooks
 
 lint: $(READY)
 	$(BIN)/ruff check
@@ -30,6 +31,10 @@ lint: $(READY)
 
 lab: $(READY)
 	$(BIN)/jupyter lab notebooks
+
+# The executed lessons as pages for any browser, without network or server.
+lessons: $(READY)
+	$(BIN)/python docs/site/build.py --workers $(WORKERS) --out build/lessons
 
 # The stamp is younger than what it was made from: a second run installs nothing.
 # The package is installed in place, so that edits need no installation either.
