@@ -66,7 +66,9 @@ def _load() -> None:
 
 
 def _quiet() -> None:
-    """Limits that cannot all be kept are an ordinary sight here."""
+    """Let pages go first, and limits that cannot all be kept pass without a word."""
+    if hasattr(os, "nice"):
+        os.nice(10)
     logging.getLogger("nmss_lab").setLevel(logging.ERROR)
 
 
