@@ -185,6 +185,15 @@ class Server:
             )
         self.url = self._address()
 
+    def faults(self) -> list[str]:
+        """Return the log's tracebacks that go through the program's own code.
+
+        Others are the server framework's, such as a page that was closed while an
+        answer was on its way.
+        """
+        parts = re.split(r"(?m)^Traceback ", self.log.read_text())[1:]
+        return [part for part in parts if re.search(r"/(apps|nmss_lab)/\w+", part)]
+
     def _address(self) -> str:
         first = self.process.stdout.readline()
         found = re.search(r"http://127\.0\.0\.1:\d+/", first)
