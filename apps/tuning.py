@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -814,20 +814,3 @@ def _wrapped(line: str) -> list[str]:
         break_long_words=False,
         break_on_hyphens=False,
     )
-
-
-@dataclass(frozen=True, eq=False)
-class _Found(Weights):
-    """Weights that were found, whatever the vector."""
-
-    found: Mapping[str, Array] = field(default_factory=dict)
-
-    def matrices(self, vector: Array) -> dict[str, Array]:
-        """Give those that were found."""
-        return dict(self.found)
-
-
-def with_weights(free: Weights, found: Mapping[str, Array]) -> Design:
-    """Design with the weights of a step of a search, exactly."""
-    own = _Found(free.design, free.full, free.fixed, free.per_step, found)
-    return own.apply(free.start)

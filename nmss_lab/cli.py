@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from nmss_lab import __version__
-from nmss_lab.cli_studies import add_study, add_tune
+from nmss_lab.cli_studies import add_study, add_tune, designs_of
 from nmss_lab.cli_studies import line as _line
 
 __all__ = ["main"]
@@ -254,20 +254,17 @@ def _simulate(arguments: argparse.Namespace) -> None:
             print(f"{name:<28}{case.title}\n{'':<28}{', '.join(case.designs)}")
         return
     case = cases.case(arguments.case)
-    names = [arguments.structure] if arguments.structure else list(case.designs)
-    if names[0] not in case.designs:
-        known = ", ".join(case.designs)
-        raise ValueError(f'structure "{names[0]}": this case has {known}')
-    if arguments.csv and len(names) > 1:
+    designs = designs_of(case, arguments.structure and [arguments.structure])
+    if arguments.csv and len(designs) > 1:
         raise ValueError("--csv writes one run: name it with --structure")
     closed_loop = importlib.import_module("nmss_lab.simulate").closed_loop
     runs = {
-        name: closed_loop(case.plant, case.designs[name].build(), case.scenario)
-        for name in names
+        name: closed_loop(case.plant, design.build(), case.scenario)
+        for name, design in designs.items()
     }
     _print_runs(case, runs)
     if arguments.csv:
-        _write_run(runs[names[0]], arguments.csv)
+        _write_run(next(iter(runs.values())), arguments.csv)
 
 
 def _print_runs(case: Any, runs: Mapping[str, Any]) -> None:

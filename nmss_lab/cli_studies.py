@@ -91,8 +91,8 @@ def line(cells: Iterable[str]) -> str:
     return f"{first:<24}" + "".join(f"{cell:>12}" for cell in rest)
 
 
-def _designs(case: Case, names: Sequence[str] | None) -> dict[str, Any]:
-    """Pick designs of a case by name."""
+def designs_of(case: Case, names: Sequence[str] | None) -> dict[str, Any]:
+    """Pick designs of a case by name, all without any."""
     for name in names or ():
         if name not in case.designs:
             known = ", ".join(case.designs)
@@ -158,7 +158,7 @@ def _collect(
     from nmss_lab.montecarlo import monte_carlo_parts
     from nmss_lab.parallel import executor_for
 
-    designs = _designs(case, arguments.structure)
+    designs = designs_of(case, arguments.structure)
     with executor_for(arguments.workers, arguments.cluster) as executor:
         for part in monte_carlo_parts(
             designs,
@@ -207,17 +207,17 @@ def _uncertainty(case: Case, arguments: argparse.Namespace) -> tuple[Uncertainty
 def _stressed(case: Case, kind: str) -> tuple[Uncertainty, str]:
     """Return draws or corners of a stress level, sampled as the case's plant is."""
     from nmss_lab.cases import stress
+    from nmss_lab.models import LinearPlant
 
     if not case.name.startswith("ifac93"):
         raise ValueError(
             f"{case.name}: stress levels are those of the IFAC'93 plant; take "
             "--uncertainty ranges"
         )
-    between = getattr(case.plant, "between", None)
-    substeps = 1 if between is None else len(between.times)
+    assert isinstance(case.plant, LinearPlant)  # these cases are sampled ones
     corners, level = kind.startswith("corners"), int(kind[-1])
     told = f"{'corners' if corners else 'draws'} of stress level {level} (Table 4.1)"
-    return stress(level, corners, case.plant.dt, substeps), told
+    return stress(level, corners, case.plant.dt, case.plant.substeps), told
 
 
 def _events(case: Case) -> Mapping[str, Event]:
@@ -281,7 +281,7 @@ def _tune(arguments: argparse.Namespace) -> int:
     _check_folder(arguments.design)
     chosen = case(arguments.case)
     name = arguments.structure or next(iter(chosen.designs))
-    design = _designs(chosen, [name])[name]
+    design = designs_of(chosen, [name])[name]
     weights = Weights(design, per_step=arguments.per_step)
     trials = [Trial(chosen.plant, chosen.scenario)]
     if arguments.goal:

@@ -171,12 +171,13 @@ def table(runs: Mapping[str, Run], channel: int = 0) -> list[dict[str, str | flo
 
     Times are in seconds, overshoot in per cent; nan where a step has no such time.
     """
-    return [{"run": name, **summary(run, channel)} for name, run in runs.items()]
+    return [
+        {"run": name, **summary(measures(run, channel))} for name, run in runs.items()
+    ]
 
 
-def summary(run: Run, channel: int = 0) -> dict[str, float]:
-    """Row of ``table`` for one run, without its name."""
-    found = measures(run, channel)
+def summary(found: Measures) -> dict[str, float]:
+    """Row of ``table`` for the measures of a run, without its name."""
     first = found.steps[0] if found.steps else None
     broken = sum(part.samples for part in found.violations.values())
     return {

@@ -123,6 +123,11 @@ class LinearPlant:
         """Number of measured disturbances."""
         return self.G.shape[1]
 
+    @property
+    def substeps(self) -> int:
+        """Number of outputs in an interval, as ``ContinuousPlant.sampled`` takes it."""
+        return 1 if self.between is None else len(self.between.times)
+
     def reset(self, u0: Array, v0: Array, y0: Array | None = None) -> Array:
         """State at rest for constant inputs ``u0`` (n_u,) and disturbances ``v0``.
 

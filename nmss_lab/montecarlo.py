@@ -20,7 +20,8 @@ import numpy as np
 from nmss_lab.analysis import linear_loop
 from nmss_lab.controller import Controller, Status
 from nmss_lab.design import VARYING, Design
-from nmss_lab.measures import summary, violations
+from nmss_lab.measures import measures as measures_of
+from nmss_lab.measures import summary
 from nmss_lab.models import Array, DifferenceModel, LinearPlant
 from nmss_lab.parallel import each
 from nmss_lab.simulate import Run, Scenario, loops_of
@@ -56,15 +57,20 @@ class Signals:
     y: Array
     u: Array
 
-    def band(self, quantiles: Sequence[float] = (0.025, 0.5, 0.975)) -> Array:
-        """Quantiles of y over the realisations, (len(quantiles), N, n_y).
+    def band(
+        self,
+        quantiles: Sequence[float] = (0.025, 0.5, 0.975),
+        signal: Literal["y", "u"] = "y",
+    ) -> Array:
+        """Quantiles over the realisations, (len(quantiles), N, channels).
 
         Loops that were given up count as infinitely far away, on either side in turn.
         """
-        away = np.where(np.arange(len(self.y)) % 2, -np.inf, np.inf)[:, None, None]
-        y = np.sort(np.where(np.isnan(self.y), away, self.y), axis=0)
-        place = [min(int(q * len(y)), len(y) - 1) for q in quantiles]
-        return y[place]
+        values = self.y if signal == "y" else self.u
+        away = np.where(np.arange(len(values)) % 2, -np.inf, np.inf)[:, None, None]
+        ranked = np.sort(np.where(np.isnan(values), away, values), axis=0)
+        place = [min(int(q * len(ranked)), len(ranked) - 1) for q in quantiles]
+        return ranked[place]
 
 
 @dataclass(frozen=True, eq=False)
@@ -411,11 +417,12 @@ def _measured(run: Run, channel: int) -> dict[str, float | bool]:
     """Measures of one loop; what cannot be told of a loop given up is infinite."""
     diverged = bool(np.isnan(run.y).any())
     failed = np.isin(run.status, (Status.SHIFTED, Status.HELD))
-    worst = [part.worst for part in violations(run).values()]
+    found = measures_of(run, channel)
+    worst = [part.worst for part in found.violations.values()]
     if diverged and not np.isfinite(np.hstack(_limits_of_y(run))).any():
         worst.pop()  # y has no limit that it could be beyond
     told: dict[str, float | bool] = {
-        **summary(run, channel),
+        **summary(found),
         "peak": float(np.abs(run.y_fine[:, channel]).max()),
         "excess": float(np.max(worst)),
         "failures": float(failed.mean()),

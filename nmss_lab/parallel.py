@@ -14,7 +14,7 @@ import os
 import queue
 import signal
 import socket
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import (
     BrokenExecutor,
     CancelledError,
@@ -106,15 +106,6 @@ def in_order(
             while due in waiting:
                 yield waiting.pop(due)
                 due += 1
-
-
-def all_of(
-    function: Callable[[Task], Result],
-    tasks: Sequence[Task],
-    executor: Executor | None = None,
-) -> list[Result]:
-    """Results of ``each`` as a list, in the order of the tasks."""
-    return list(in_order(function, tasks, executor))
 
 
 @contextmanager

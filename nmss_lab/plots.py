@@ -14,7 +14,7 @@ import dataclasses
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from bokeh.layouts import gridplot
@@ -1356,16 +1356,17 @@ def ensemble_charts(
 
 
 def _band_clouds(
-    study: MonteCarlo, nominal: Mapping[str, Run], signal: str, channel: int
+    study: MonteCarlo,
+    nominal: Mapping[str, Run],
+    signal: Literal["y", "u"],
+    channel: int,
 ) -> tuple[Cloud, ...]:
     clouds = []
     for style, (name, run) in enumerate(nominal.items()):
-        kept = study.signals[name]
-        if signal == "u":  # bands of u are found as those of y
-            kept = dataclasses.replace(kept, y=kept.u)
         alone = getattr(run, signal)[:, channel]
         far = 50.0 * max(float(np.ptp(alone[np.isfinite(alone)])), 1e-9)
-        low, middle, high = np.clip(kept.band()[:, :, channel], -far, far)
+        band = study.signals[name].band(signal=signal)[:, :, channel]
+        low, middle, high = np.clip(band, -far, far)
         every = slice(None, None, max(1, len(run.t) // DRAWN_POINTS))
         parts = (run.t, middle, low, high, np.clip(alone, -far, far))
         t, middle, low, high, alone = (part[every] for part in parts)

@@ -480,6 +480,7 @@ def one_by_one(matrix: Array, vectors: Array) -> Array:
     """Products with vectors (loops, n), the same whichever others there are.
 
     To the last digit: in one product of matrices rounding depends on their sizes.
+    ``matrix`` is one for all vectors, or (loops, m, n), one for each.
     """
     products: Array = (matrix @ vectors[..., None])[..., 0]
     return products

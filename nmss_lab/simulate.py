@@ -13,6 +13,7 @@ from nmss_lab.controller import Controller, Memory, Move, Status
 from nmss_lab.models import Array, DifferenceModel, LinearPlant, Numbers, Plant
 from nmss_lab.parallel import in_order
 from nmss_lab.predictive import PredictiveController
+from nmss_lab.qp import one_by_one
 from nmss_lab.state_dependent import StateDependentModel
 
 Equation = DifferenceModel | StateDependentModel
@@ -305,8 +306,7 @@ def loops_of(
     alike: dict[tuple[int, ...], list[int]] = {}
     for i, plant in enumerate(ready):
         if isinstance(plant, LinearPlant):
-            between = 0 if plant.between is None else len(plant.between.times)
-            size = plant.n_x, plant.n_y, plant.n_u, plant.n_v, between
+            size = plant.n_x, plant.n_y, plant.n_u, plant.n_v, plant.substeps
             alike.setdefault(size, []).append(i)
         else:
             runs[i] = closed_loop(plant, controller, scenario)
@@ -412,12 +412,12 @@ class _Stacked:
 
     def output(self, state: Array) -> Array:
         with np.errstate(over="ignore", invalid="ignore"):  # a loop may diverge
-            return _each(self.C, state)
+            return one_by_one(self.C, state)
 
     def step(self, state: Array, u: Array, v: Array) -> Array:
         both = np.concatenate([state, u, v], axis=1)
         with np.errstate(over="ignore", invalid="ignore"):
-            return _each(self.ABG, both)
+            return one_by_one(self.ABG, both)
 
     def between(self, state: Array, u: Array, v: Array) -> Array | None:
         """Return outputs (loops, m, n_y) between this sample and the next."""
@@ -430,11 +430,6 @@ class _Stacked:
                 + np.einsum("rmij,rj->rmi", self.between_G, v)
             )
         return inside
-
-
-def _each(matrices: Array, vectors: Array) -> Array:
-    product: Array = (matrices @ vectors[..., None])[..., 0]
-    return product
 
 
 def _times(plant: Any) -> Array | None:

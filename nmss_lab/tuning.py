@@ -560,6 +560,7 @@ class _Search:
     count: int = 0
     history: list[Step] = field(default_factory=list)
     told: int = 0
+    known: dict[bytes, Array] = field(default_factory=dict)
 
     @cached_property
     def best(self) -> _Best:
@@ -570,10 +571,6 @@ class _Search:
     def box(self) -> tuple[Array, Array]:
         low, high = np.exp(2.0 * np.array(self.ends))
         return self.problem.weights.bounds(low, high)
-
-    @cached_property
-    def known(self) -> dict[bytes, Array]:
-        return {}
 
     def run(self, starts: Sequence[Array]) -> str:
         """Search from every start; say why it ended."""

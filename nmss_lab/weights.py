@@ -193,7 +193,10 @@ class Weights:
 
     def apply(self, vector: Array) -> Design:
         """Design with the weights of a vector."""
-        found = self.matrices(vector)
+        return self.dressed(self.matrices(vector))
+
+    def dressed(self, found: Mapping[str, Array]) -> Design:
+        """Design with weights that are given by name, as ``matrices`` returns them."""
         R = self._along(found, "weight_u", self.design.horizon.Nc)
         if not self._weighs_state:
             Q = self._along(found, "weight_y", self.design.horizon.Np)

@@ -14,7 +14,7 @@ from conftest import REPLAY
 import nmss_lab as lab
 from nmss_lab import montecarlo
 from nmss_lab.cases import stress
-from nmss_lab.measures import summary
+from nmss_lab.measures import measures, summary
 from nmss_lab.montecarlo import EVENTS, PART, Event, event, join, wilson
 
 MODEL = lab.DifferenceModel([-1.5, 0.56], [0.1, 0.08])
@@ -56,7 +56,7 @@ def test_columns(study: lab.MonteCarlo) -> None:
     """Who, what was drawn, the largest pole, the measures, and how it ended."""
     first = ["design", "realisation", "output", "a1", "a2", "b1", "b2", "radius"]
     last = ["peak", "excess", "failures", "diverged"]
-    measured = list(summary(study.runs["feedback"][0]))
+    measured = list(summary(measures(study.runs["feedback"][0])))
     assert list(study.table.columns) == [*first, *measured, *last]
 
 
@@ -67,7 +67,7 @@ def test_rows_are_the_measures_of_their_loop(study: lab.MonteCarlo) -> None:
         drawn = lab.realisation(RANGES, i)
         run = lab.closed_loop(drawn.plant, controller, SCENARIO)
         row = study.table.query("design == @name and realisation == @i").iloc[0]
-        for key, value in {**summary(run), **drawn.values}.items():
+        for key, value in {**summary(measures(run)), **drawn.values}.items():
             # another order of sums in lock step
             assert row[key] == pytest.approx(value, abs=100 * REPLAY, nan_ok=True), key
         loop = lab.linear_loop(controller, drawn.plant)
@@ -367,7 +367,7 @@ def test_state_dependent_plants() -> None:
     assert np.isnan(found.poles["frozen"]).all()
     run = lab.closed_loop(model.plant(), designs["frozen"].build(), example.scenario)
     frozen = found.table.query("design == 'frozen'")
-    assert frozen["IAE"].tolist() == pytest.approx([summary(run)["IAE"]] * 3)
+    assert frozen["IAE"].tolist() == pytest.approx([summary(measures(run))["IAE"]] * 3)
     assert found.rates().query("event == 'unstable'")["count"].tolist() == [0, 0]
 
 

@@ -15,7 +15,7 @@ import pytest
 
 import nmss_lab as lab
 from nmss_lab import montecarlo
-from nmss_lab.parallel import all_of, each, executor_for, in_order
+from nmss_lab.parallel import each, executor_for, in_order
 
 MODEL = lab.DifferenceModel([-1.5, 0.56], [0.1, 0.08])
 DESIGN = lab.Design(
@@ -131,20 +131,20 @@ def test_results_carry_their_numbers(anywhere: Executor | None) -> None:
 def test_order_is_that_of_the_tasks(anywhere: Executor | None) -> None:
     """Tasks that end in another order are given back in theirs."""
     tasks = [(0.3, 0), (0.0, 1), (0.1, 2), (0.0, 3)]
-    assert all_of(squared_later, tasks, anywhere) == [0, 1, 4, 9]
+    assert list(in_order(squared_later, tasks, anywhere)) == [0, 1, 4, 9]
     assert list(in_order(squared_later, tasks, anywhere)) == [0, 1, 4, 9]
 
 
 def test_no_tasks_no_results(anywhere: Executor | None) -> None:
     """Nothing to do is no error."""
-    assert all_of(square, [], anywhere) == []
+    assert list(in_order(square, [], anywhere)) == []
 
 
 def test_executors_are_other_processes(pool: Executor, cluster: object) -> None:
     """The comparison below compares something: tasks do not run in this process."""
-    assert os.getpid() not in all_of(where, range(4), pool)
+    assert os.getpid() not in in_order(where, range(4), pool)
     with executor_for(cluster=cluster.scheduler_address) as executor:
-        found = set(all_of(where, range(8), executor))
+        found = set(in_order(where, range(8), executor))
     assert os.getpid() not in found
 
 
@@ -318,7 +318,7 @@ def test_a_study_survives_a_worker_killed_from_outside(
     """Parts that were done on a dead worker, but not yet fetched, are made again."""
     designs = {"one": DESIGN, "two": lab.Design("forward_path", MODEL, R=0.1)}
     with executor_for(cluster=cluster.scheduler_address) as executor:
-        victim = all_of(where, [0], executor)[0]
+        victim = next(in_order(where, [0], executor))
         parts = lab.monte_carlo_parts(
             designs,
             UNCERTAIN,

@@ -19,7 +19,7 @@ from playwright.sync_api import Browser, Page, expect
 from apps.goals import KINDS, MOST_GOALS, Aim, aims_of, gain_of
 from apps.pages.tune import TunePage
 from apps.session import KEPT, LoopChoices
-from apps.tuning import TuneChoices, first_order, with_weights
+from apps.tuning import TuneChoices, first_order
 from apps.weight_tables import parts_of
 from nmss_lab.cases import shell_desired, shell_step
 from nmss_lab.design import Design
@@ -225,7 +225,7 @@ def test_weights_are_shown_as_they_are() -> None:
     assert np.array_equal(u, np.array(design.R))
     free = choices.free(choices.start())
     vector = free.start + 0.3
-    made = with_weights(free, free.matrices(vector))
+    made = free.dressed(free.matrices(vector))
     assert np.array_equal(made.Q, free.apply(vector).Q)
 
 

@@ -35,7 +35,7 @@ from apps.pages.live import (
 )
 from apps.player import STYLE, Controls, script
 from apps.session import plain
-from apps.tuning import LOOK, OTHERWISE, TuneChoices, with_weights
+from apps.tuning import LOOK, OTHERWISE, TuneChoices
 from apps.weight_tables import weight_table
 from apps.work import WAITING, Lent, ends_with_the_server, processes
 from nmss_lab.design import Design
@@ -475,7 +475,7 @@ class TunePage(WithForm, BackgroundPage):
         if not np.isfinite(step.attainment):
             return
         try:
-            design = with_weights(job["weights"], step.weights)
+            design = job["weights"].dressed(step.weights)
             bench.runs(design)
         except (ValueError, np.linalg.LinAlgError):
             return  # the picture of the one before stays
