@@ -16,8 +16,6 @@ import numpy as np
 import param
 
 from apps.session import (
-    KEPT,
-    ORIGINS,
     LoopChoices,
     Origin,
     _largest,
@@ -272,12 +270,6 @@ class RobustnessChoices(LoopChoices):
         """Number of realisations of the study."""
         return self.n if self.uncertainty in DRAWN else self.plants().size or 0
 
-    @property
-    def _substeps(self) -> int:
-        plant = self.example.plant
-        between = plant.between if isinstance(plant, LinearPlant) else None
-        return len(between.times) if between else 1
-
     def plants(self) -> Uncertainty:
         """Plants that might be the true one.
 
@@ -296,11 +288,14 @@ class RobustnessChoices(LoopChoices):
             return RelativeRanges(model, self._shares())
         if self.uncertainty.startswith("stress"):
             level, dt = int(self.level), example.plant.dt
-            return stress(level, corners, dt, self._substeps)
+            return stress(level, corners, dt, example.plant.substeps)
         build: Any = functools.partial(multiplied, model)
         if example.continuous is not None:
             build = functools.partial(
-                slower, example.continuous, example.plant.dt, self._substeps
+                slower,
+                example.continuous,
+                example.plant.dt,
+                example.plant.substeps,
             )
         return Intervals(build, self._intervals(), corners)
 
@@ -365,8 +360,9 @@ class RobustnessChoices(LoopChoices):
         """Python that makes the study, up to its results; tells studies apart."""
         size = f"n={self.n}, seed={self.seed}" if self.uncertainty in DRAWN else ""
         arguments = ["designs", "uncertainty", "scenario", *([size] if size else [])]
+        names = "from nmss_lab.montecarlo import EVENTS, event, monte_carlo"
         return [
-            *self._imports(),
+            *self._head([names, *self._study_imports()]),
             "",
             *self._case_lines(),
             *self._scenario_lines(),
@@ -396,33 +392,17 @@ class RobustnessChoices(LoopChoices):
         """Python that computes what the page shows."""
         return self.rates_script(self.output, self.peak)
 
-    def _imports(self) -> list[str]:
-        more = [
-            "from nmss_lab.montecarlo import EVENTS, event, monte_carlo",
-            "from nmss_lab.predict import Horizon",
-            "from nmss_lab.cases import case, piecewise",
-            *self._uncertainty_imports(),
-        ]
-        if self.case in KEPT:
-            more[2] = "from nmss_lab.cases import piecewise"
-            more += ORIGINS[self.case].imports
-        plainly = sorted({line for line in more if line.startswith("import ")})
-        named = sorted({line for line in more if line.startswith("from nmss_lab")})
+    def _study_imports(self) -> list[str]:
+        """Say what scenario, designs and uncertainty import."""
         return [
-            *plainly,
-            "from dataclasses import replace",
-            "",
-            "import numpy as np",
-            "",
-            *named,
+            "from nmss_lab.cases import piecewise",
+            "from nmss_lab.predict import Horizon",
+            *self._uncertainty_imports(),
         ]
 
     def _uncertainty_imports(self) -> list[str]:
         if self.uncertainty == "covariance":
-            return [
-                "from nmss_lab.models import DifferenceModel",
-                "from nmss_lab.uncertainty import ParameterCovariance",
-            ]
+            return ["from nmss_lab.uncertainty import ParameterCovariance"]
         if self.uncertainty == "ranges":
             return ["from nmss_lab.uncertainty import RelativeRanges"]
         if self.uncertainty.startswith("stress"):
@@ -435,10 +415,10 @@ class RobustnessChoices(LoopChoices):
         ]
 
     def _uncertainty_lines(self) -> list[str]:
-        corners = self.uncertainty.endswith("_corners")
+        corners, example = self.uncertainty.endswith("_corners"), self.example
         dt = "example.plant.dt"
         if self.uncertainty == "covariance":
-            model, covariance = self.example.model, self.example.covariance
+            model, covariance = example.model, example.covariance
             if covariance is not None and len(covariance) == model.na + model.nb:
                 return [
                     "uncertainty = ParameterCovariance("
@@ -457,7 +437,8 @@ class RobustnessChoices(LoopChoices):
             return [f"uncertainty = RelativeRanges(example.model, {self._shares()})"]
         if self.uncertainty.startswith("stress"):
             return [
-                f"uncertainty = stress({self.level}, {corners}, {dt}, {self._substeps})"
+                f"uncertainty = stress({self.level}, {corners}, {dt}, "
+                f"{example.plant.substeps})"
             ]
         function: Any = multiplied
         start = "functools.partial(multiplied, example.model)"
@@ -465,7 +446,7 @@ class RobustnessChoices(LoopChoices):
             function, start = (
                 slower,
                 f"functools.partial(slower, example.continuous, {dt}, "
-                f"{self._substeps})",
+                f"{example.plant.substeps})",
             )
         return [
             "",
@@ -519,15 +500,12 @@ class RobustnessChoices(LoopChoices):
             "continuous=None",
             ")",
         ]
-        known = (
-            "from dataclasses import replace",
-            "import numpy as np",
-            "from nmss_lab.montecarlo import EVENTS, event, monte_carlo",
-            "",
+        imports = (
+            *self._study_imports(),
+            *self._case_imports(),
+            "from nmss_lab.uncertainty import realisation",
         )
-        imports = [line for line in self._imports() if line not in known]
-        imports.append("from nmss_lab.uncertainty import realisation")
-        origin = Origin(tuple(imports), tuple(lines))
+        origin = Origin(imports, tuple(lines))
         return keep_case("drawn", f"{self.case}{lines}", drawn, origin)
 
     def _of_drawn(self, number: int, samples: int | None) -> str:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Any, ClassVar, NamedTuple
 
@@ -416,8 +416,7 @@ class Choices(Form):
         example, plant = self.example, self.example.plant
         if self.dynamics and example.continuous is not None:
             slower = 1.0 + self.dynamics / 100.0
-            substeps = len(plant.between.times) if plant.between else 1
-            plant = example.continuous.sampled(plant.dt / slower, substeps)
+            plant = example.continuous.sampled(plant.dt / slower, plant.substeps)
             between = plant.between and replace(
                 plant.between, times=plant.between.times * slower
             )
@@ -509,7 +508,7 @@ class Choices(Form):
     def script(self) -> str:
         """Python that computes what the page shows and prints its measures."""
         lines = [
-            *self._imports(),
+            *self._head(_SCRIPT_IMPORTS),
             "",
             *self._case_lines(),
             *self._plant_lines(),
@@ -522,13 +521,15 @@ class Choices(Form):
         ]
         return "\n".join(lines) + "\n"
 
-    def _imports(self) -> list[str]:
+    def _head(self, imports: Iterable[str]) -> list[str]:
+        """First lines of a script: what it imports, and what its case needs."""
+        return head([*imports, *self._case_imports()])
+
+    def _case_imports(self) -> tuple[str, ...]:
+        """Say what ``_case_lines`` import."""
         if self.case not in KEPT:
-            return list(_SCRIPT_IMPORTS)
-        own = [line for line in _SCRIPT_IMPORTS if "nmss_lab.cases" not in line]
-        more = "from nmss_lab.cases import piecewise", *ORIGINS[self.case].imports
-        start = own.index("from nmss_lab.measures import table")
-        return own[:start] + sorted({*own[start:], *more})
+            return ("from nmss_lab.cases import case",)
+        return ORIGINS[self.case].imports
 
     def _case_lines(self) -> list[str]:
         if self.case not in KEPT:
@@ -538,11 +539,10 @@ class Choices(Form):
     def _plant_lines(self) -> list[str]:
         lines = ["plant = example.plant"]
         if self.dynamics and self.example.continuous is not None:
-            between = self.example.plant.between
             lines += [
                 f"slower = 1.0 + {self.dynamics!r} / 100.0",
                 "plant = example.continuous.sampled("
-                f"plant.dt / slower, {len(between.times) if between else 1})",
+                f"plant.dt / slower, {self.example.plant.substeps})",
                 "between = plant.between and replace(",
                 "    plant.between, times=plant.between.times * slower",
                 ")",
@@ -860,12 +860,46 @@ class GovernorChoices(Choices):
         ]
 
 
+def head(imports: Iterable[str]) -> list[str]:
+    """Write the imports of a script in groups, those from one module in one line.
+
+    ``replace`` and NumPy, which every script uses, come without being asked for.
+    """
+    groups: list[list[str]] = [
+        ["from dataclasses import replace"],
+        ["import numpy as np"],
+        [],
+    ]
+    for line in imports:
+        module = line.split()[1].partition(".")[0]
+        groups[{"scipy": 1, "nmss_lab": 2}.get(module, 0)].append(line)
+    lines: list[str] = []
+    for group in groups:
+        lines += ["", *_joined(group)]
+    return lines[1:]
+
+
+def _as_sorted(name: str) -> tuple[bool, str]:
+    """Sort constants first, and the case of letters not at all."""
+    return not name.isupper(), name.lower()
+
+
+def _joined(imports: Iterable[str]) -> list[str]:
+    plainly, found = set(), dict[str, set[str]]()
+    for line in imports:
+        module, is_from, names = line.partition(" import ")
+        if is_from:
+            found.setdefault(module, set()).update(names.split(", "))
+        else:
+            plainly.add(line)
+    return sorted(plainly) + [
+        f"{module} import {', '.join(sorted(names, key=_as_sorted))}"
+        for module, names in sorted(found.items())
+    ]
+
+
 _SCRIPT_IMPORTS = (
-    "from dataclasses import replace",
-    "",
-    "import numpy as np",
-    "",
-    "from nmss_lab.cases import case, piecewise",
+    "from nmss_lab.cases import piecewise",
     "from nmss_lab.measures import table",
     "from nmss_lab.predict import Horizon",
     "from nmss_lab.simulate import closed_loop",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, ClassVar
 
@@ -12,7 +12,7 @@ import param
 from scipy.signal import lfilter
 
 from apps.goals import KINDS, MOST_GOALS, OVER, Aim, Bench, aims_of
-from apps.session import KEPT, ORIGINS, LoopChoices, Origin, keep_case, known_case
+from apps.session import KEPT, LoopChoices, Origin, keep_case, known_case
 from nmss_lab.cases import Case, piecewise, stress
 from nmss_lab.design import Design
 from nmss_lab.files import dumps
@@ -397,14 +397,9 @@ class TuneChoices(LoopChoices):
             )
             return [model, *(draw.plant for draw in draws)]
         if self.plants == "stress":
-            corners = stress(self.level, True, plant.dt, self._substeps)
+            corners = stress(self.level, True, plant.dt, self.example.plant.substeps)
             return [draw.plant for draw in realisations(corners)]
         return plant
-
-    @property
-    def _substeps(self) -> int:
-        between = getattr(self.example.plant, "between", None)
-        return len(between.times) if between else 1
 
     @property
     def by_step(self) -> bool:
@@ -600,26 +595,8 @@ class TuneChoices(LoopChoices):
         else:
             names, more = self._tune_lines(design, aims)
             lines += more
+        names.append("from nmss_lab.predict import Horizon")
         return "\n".join([*self._head(names), "", *lines]) + "\n"
-
-    def _head(self, names: Sequence[str]) -> list[str]:
-        known = [
-            "from nmss_lab.cases import case",
-            "from nmss_lab.predict import Horizon",
-            *names,
-        ]
-        if self.case in KEPT:
-            known = [*known[1:], *ORIGINS[self.case].imports]
-        scipy = [line for line in known if "scipy" in line]
-        own = _joined(line for line in known if line not in scipy)
-        return [
-            "from dataclasses import replace",
-            "",
-            "import numpy as np",
-            *scipy,
-            "",
-            *own,
-        ]
 
     def design_lines(self, name: str, design: Design) -> list[str]:
         """Lines that make a design from the case's."""
@@ -717,7 +694,8 @@ class TuneChoices(LoopChoices):
                 "from nmss_lab.uncertainty import realisations",
             ]
             lines = [
-                f"corners = stress({self.level}, True, {self._dt!r}, {self._substeps})",
+                f"corners = stress({self.level}, True, {self._dt!r}, "
+                f"{self.example.plant.substeps})",
                 "plants = [draw.plant for draw in realisations(corners)]",
             ]
         if not self.by_step:
@@ -755,15 +733,7 @@ class TuneChoices(LoopChoices):
         others = {k: d for k, d in example.designs.items() if k not in designs}
         title = example.title if self.case in KEPT else f"{example.title}, tuned"
         made: Case = replace(example, title=title, designs={**designs, **others})
-        imports = {
-            "from nmss_lab.cases import case",
-            "from nmss_lab.predict import Horizon",
-        }
-        if self.case in KEPT:
-            imports = {
-                "from nmss_lab.predict import Horizon",
-                *ORIGINS[self.case].imports,
-            }
+        imports = *self._case_imports(), "from nmss_lab.predict import Horizon"
         lines = (
             *self._case_lines(),
             *self.design_lines("tuned", tuned),
@@ -773,7 +743,7 @@ class TuneChoices(LoopChoices):
             "example = replace(example, designs={**designs, **others})",
         )
         content = self.case + dumps(tuned) + dumps(before)
-        return keep_case("tuned", content, made, Origin(tuple(sorted(imports)), lines))
+        return keep_case("tuned", content, made, Origin(imports, lines))
 
 
 def first_order(reference: Array, rest: Array, lag: int, pole: float) -> Array:
@@ -781,18 +751,6 @@ def first_order(reference: Array, rest: Array, lag: int, pole: float) -> Array:
     b, a = [0.0] * lag + [1.0 - pole], [1.0, -pole]
     desired: Array = rest + lfilter(b, a, reference - rest, axis=0)
     return desired
-
-
-def _joined(lines: Iterable[str]) -> list[str]:
-    """Sort imports, those from one module in one line."""
-    found: dict[str, set[str]] = {}
-    for line in lines:
-        module, _, names = line.partition(" import ")
-        found.setdefault(module, set()).update(names.split(", "))
-    return [
-        f"{module} import {', '.join(sorted(names, key=str.lower))}"
-        for module, names in sorted(found.items())
-    ]
 
 
 def _array(value: Any) -> str:

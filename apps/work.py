@@ -29,6 +29,8 @@ from bokeh.document import Document
 WAITING = ThreadPoolExecutor(max_workers=8, thread_name_prefix="waiting")
 """One thread for each study or search of all sessions; more of them wait."""
 
+PROCESSES = min(os.cpu_count() or 1, 4)
+
 _LOCK = threading.Lock()
 _POOLS: list[ProcessPoolExecutor] = []
 
@@ -48,16 +50,15 @@ def processes() -> ProcessPoolExecutor:
             # Each keeps to one thread inside BLAS: they would only collide.
             os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
             fresh = multiprocessing.get_context("spawn")
-            count = min(os.cpu_count() or 1, 4)
             _POOLS.append(
-                ProcessPoolExecutor(count, mp_context=fresh, initializer=_quiet)
+                ProcessPoolExecutor(PROCESSES, mp_context=fresh, initializer=_quiet)
             )
         return _POOLS[0]
 
 
 def get_ready() -> None:
-    """Have the processes begin and load what studies need, before one asks for it."""
-    WAITING.submit(lambda: [processes().submit(_load) for _ in range(2)])
+    """Have the processes begin and load what work needs, before one asks for it."""
+    WAITING.submit(lambda: [processes().submit(_load) for _ in range(PROCESSES)])
 
 
 def _load() -> None:

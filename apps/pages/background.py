@@ -13,6 +13,15 @@ from apps.pages.live import FAULT, KEPT
 LOG = logging.getLogger(__name__)
 
 
+def hand_over(component: Any, name: str, /, **what: Any) -> None:
+    """Have the browser keep a file ("saved"), open an address ("leads") or the like.
+
+    The number tells the same thing asked for twice from the same thing told twice.
+    """
+    number = getattr(component, name).get("number", 0) + 1
+    setattr(component, name, {**what, "number": number})
+
+
 class BackgroundPage:
     """One session's page: what threads find out is said on its event loop."""
 

@@ -20,7 +20,7 @@ from bokeh.models import BoxAnnotation, Range1d
 from panel.custom import JSComponent
 
 from apps.identification import LARGEST, LOOK, RECORDS, IdentifyChoices, uploaded
-from apps.pages.background import BackgroundPage
+from apps.pages.background import BackgroundPage, hand_over
 from apps.pages.live import (
     ADDRESS,
     FAULT,
@@ -29,6 +29,7 @@ from apps.pages.live import (
     _number,
     _paragraph,
     _text,
+    fill,
     page_template,
 )
 from apps.player import STYLE, Controls, script
@@ -39,6 +40,8 @@ from nmss_lab.plots import Chart, EstimateFigure, estimate_charts, record_charts
 
 LOG = logging.getLogger(__name__)
 PATH, HEADING = "identify", "Identify"
+
+PARTS = "lead", "alert", "ranking", "measures", "python", "upload", "controls"
 
 WORKERS = ThreadPoolExecutor(max_workers=2, thread_name_prefix="search")
 """Searches of all sessions; more of them wait."""
@@ -313,14 +316,11 @@ class IdentifyPage(BackgroundPage):
         found = self.found[which].estimate
         assert found is not None
         if act == "save":
-            number = self.ranking.saved.get("number", 0) + 1
-            text = dumps(found)
-            self.ranking.saved = {"name": "model.json", "text": text, "number": number}
+            hand_over(self.ranking, "saved", name="model.json", text=dumps(found))
         else:
-            number = self.ranking.leads.get("number", 0) + 1
             page = {"control": "receding_horizon", "govern": "governor"}[act]
             to = f"{page}?case={keep_model(found)}"
-            self.ranking.leads = {"to": to, "number": number}
+            hand_over(self.ranking, "leads", to=to)
 
     def _forget(self) -> None:
         """Drop the ranking of another record."""
@@ -408,19 +408,7 @@ class IdentifyPage(BackgroundPage):
     def template(self) -> pn.Template:
         """Put the page together."""
         page = page_template(PATH, HEADING, list(self.figures))
-        for name in (
-            "lead",
-            "alert",
-            "ranking",
-            "measures",
-            "python",
-            "upload",
-            "controls",
-        ):
-            page.add_panel(name, getattr(self, name))
-        for name, drawn in self.figures.items():
-            pane = pn.pane.Bokeh(drawn.figure, sizing_mode="stretch_both")
-            page.add_panel(f"chart_{name}", pane)
+        fill(page, self, PARTS, self.figures)
         self.served = True
         return page
 

@@ -92,6 +92,15 @@ class WithForm:
         values = self.choices.values()
         return {"values": values, "message": message, "form": self._forms}
 
+    def _accept(self, sent: Mapping[str, Any]) -> None:
+        """Take over what the form sent: all anew, another case, or choices."""
+        if sent.get("reset", False):
+            self.choices.take_case(self.choices.default_case)
+        elif sent.get("case") != self.choices.case:
+            self.choices.accept({"case": sent.get("case")})
+        else:
+            self.choices.accept(sent)
+
 
 class LivePage(WithForm):
     """One session's page: keeps the last good picture whatever is chosen."""
@@ -180,14 +189,6 @@ class LivePage(WithForm):
             self._measure()
         self.controls.state = self._state(message)
 
-    def _accept(self, sent: dict[str, Any]) -> None:
-        if sent.pop("reset", False):
-            self.choices.take_case(self.subject.choices.default_case)
-        elif sent.get("case") != self.choices.case:
-            self.choices.accept({"case": sent.get("case")})
-        else:
-            self.choices.accept(sent)
-
     def _tell(self) -> None:
         """Words around the plots."""
         example, look = self.choices.example, self.subject.look
@@ -204,25 +205,12 @@ class LivePage(WithForm):
 
     def template(self) -> pn.Template:
         """Put the page together."""
-        page = page_template(
-            self.subject.path, self.subject.heading, list(self.figures)
-        )
+        subject = self.subject
+        page = page_template(subject.path, subject.heading, list(self.figures))
         page.add_variable("within", list(self.within))
-        for name in (
-            "lead",
-            "alert",
-            "player",
-            "measures",
-            "python",
-            "notes",
-            "controls",
-        ):
-            page.add_panel(name, getattr(self, name))
+        fill(page, self, PARTS, {**self.figures, **self.within})
         if self.inside is not None:
             page.add_panel("inside", self.inside)
-        for name, drawn in {**self.figures, **self.within}.items():
-            pane = pn.pane.Bokeh(drawn.figure, sizing_mode="stretch_both")
-            page.add_panel(f"chart_{name}", pane)
         return page
 
 
@@ -241,6 +229,20 @@ def page_template(path: str, heading: str, charts: Sequence[str] = ()) -> pn.Tem
     page.add_variable("heading", heading)
     page.add_variable("charts", list(charts))
     return page
+
+
+def fill(
+    page: pn.Template,
+    owner: Any,
+    parts: Iterable[str],
+    figures: Mapping[str, ChartFigure],
+) -> None:
+    """Put attributes of a page's owner, and its figures, into the frame by name."""
+    for name in parts:
+        page.add_panel(name, getattr(owner, name))
+    for name, drawn in figures.items():
+        pane = pn.pane.Bokeh(drawn.figure, sizing_mode="stretch_both")
+        page.add_panel(f"chart_{name}", pane)
 
 
 @cache

@@ -19,7 +19,7 @@ import param
 from bokeh.models import Range1d
 from panel.custom import JSComponent
 
-from apps.pages.background import BackgroundPage
+from apps.pages.background import BackgroundPage, hand_over
 from apps.pages.live import (
     FAULT,
     WithForm,
@@ -28,6 +28,7 @@ from apps.pages.live import (
     _number,
     _paragraph,
     _text,
+    fill,
     page_template,
 )
 from apps.player import STYLE, Controls, script
@@ -66,6 +67,8 @@ from nmss_lab.uncertainty import Bounds, uncertainty_bounds
 
 LOG = logging.getLogger(__name__)
 PATH, HEADING = "robustness", "Robustness"
+
+PARTS = "lead", "alert", "told", "panel", "python", "notes", "controls"
 
 TOLD_EVERY = 0.2
 """Seconds between messages while a study grows."""
@@ -196,7 +199,11 @@ class RobustnessPage(WithForm, BackgroundPage):
         if fresh:
             self._forget()
             self.controls.form = self._form()
-        if good and self._stale and self._count <= (AT_FIRST if fresh else BY_ITSELF):
+        if (
+            good
+            and self._stale
+            and self.choices.count <= (AT_FIRST if fresh else BY_ITSELF)
+        ):
             self._begin()
         elif (
             good
@@ -210,13 +217,9 @@ class RobustnessPage(WithForm, BackgroundPage):
         self.panel.progress = self._progress()
         self.controls.state = self._state(message)
 
-    def _accept(self, sent: dict[str, Any]) -> None:
-        if sent.get("reset", False):
-            self.choices.take_case(self.choices.default_case)
-        elif sent.get("case") != self.choices.case:
-            self.choices.accept({"case": sent.get("case")})
-        else:
-            self.choices.accept(sent)
+    def _accept(self, sent: Mapping[str, Any]) -> None:
+        """Take over choices of which a study can be made."""
+        super()._accept(sent)
         self.choices.study()
 
     def _view(self) -> View:
@@ -228,13 +231,9 @@ class RobustnessPage(WithForm, BackgroundPage):
         """Whether there is no study, or one with other choices."""
         return self.job is None or self.job.lines != tuple(self.choices.study_lines())
 
-    @property
-    def _count(self) -> int:
-        return self.choices.count
-
     def _open(self) -> None:
         """Begin with what the address asks for."""
-        if self._count <= AT_FIRST:
+        if self.choices.count <= AT_FIRST:
             said = self.complaint
             good = self._guard(self._begin, self.choices.values())
             self.complaint = said if good else self.complaint
@@ -465,11 +464,9 @@ class RobustnessPage(WithForm, BackgroundPage):
             loci, bounds = {}, []
             for name, design in job.study.designs.items():
                 controller = design.build()
-                loci[name] = _stacked(
-                    [
-                        linear_loop(controller, model.varied(**{side: factor})).poles
-                        for factor in FACTORS.tolist()
-                    ]
+                walked = [model.varied(**{side: f}) for f in FACTORS.tolist()]
+                loci[name] = np.stack(
+                    [linear_loop(controller, plant).poles for plant in walked]
                 )
                 if job.stop.is_set() and job is not self.job:
                     return
@@ -528,11 +525,10 @@ class RobustnessPage(WithForm, BackgroundPage):
             self.panel.picked = {}
             return
         table = found.table[found.table["realisation"] == self.picked]
-        names = list(centre(job.choices))
-        nominal = centre(job.choices)
         row = table.iloc[0]
         values = [
-            [name, _number(float(row[name])), _number(nominal[name])] for name in names
+            [name, _number(float(row[name])), _number(nominal)]
+            for name, nominal in centre(job.choices).items()
         ]
         output = job.choices.example.model.y_names[self._view().output]
         own = table[table["output"] == output].set_index("design")
@@ -584,20 +580,19 @@ class RobustnessPage(WithForm, BackgroundPage):
             raise ValueError("choose a realisation first")
         choices = self.job.choices
         name = choices.keep_drawn(self.picked, self._cut())
-        number = self.panel.leads.get("number", 0) + 1
         view = self._view()
         to = f"receding_horizon?case={name}&structures={','.join(choices.structures)}"
         for key in ("output", "input"):
             to += f"&{key}={getattr(view, key)}" if getattr(view, key) else ""
-        self.panel.leads = {"to": to, "number": number}
+        hand_over(self.panel, "leads", to=to)
 
     def _save(self, what: str) -> None:
         if self.found is None:
             raise ValueError("there is no study yet: press Run")
         table = self._rates() if what == "rates" else self.found.table
-        number = self.panel.saved.get("number", 0) + 1
-        text = table.to_csv(index=False)
-        self.panel.saved = {"name": f"{what}.csv", "text": text, "number": number}
+        hand_over(
+            self.panel, "saved", name=f"{what}.csv", text=table.to_csv(index=False)
+        )
 
     # Words
 
@@ -646,7 +641,7 @@ class RobustnessPage(WithForm, BackgroundPage):
             "running": running,
             "done": self.done,
             "total": total,
-            "count": self._count,
+            "count": self.choices.count,
             "note": self.note,
             "stale": stale,
             "studied": self.found is not None,
@@ -655,11 +650,7 @@ class RobustnessPage(WithForm, BackgroundPage):
     def template(self) -> pn.Template:
         """Put the page together."""
         page = page_template(PATH, HEADING, list(self.figures))
-        for name in ("lead", "alert", "told", "panel", "python", "notes", "controls"):
-            page.add_panel(name, getattr(self, name))
-        for name, drawn in self.figures.items():
-            pane = pn.pane.Bokeh(drawn.figure, sizing_mode="stretch_both")
-            page.add_panel(f"chart_{name}", pane)
+        fill(page, self, PARTS, self.figures)
         self.served = True
         return page
 
@@ -702,12 +693,6 @@ def _figures() -> dict[str, EnsembleFigure]:
     times = Range1d(0.0, 1.0)
     shared = {"output": times, "input": times}
     return {n: EnsembleFigure(c, shared.get(n)) for n, c in charts.items()}
-
-
-def _stacked(poles: list[Any]) -> Array:
-    """Poles below each other; all have one size, as the factor leaves it."""
-    stacked: Array = np.stack(poles)
-    return stacked
 
 
 def _nearest(factor: float) -> int:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import html
 import logging
 import math
-import os
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -21,7 +20,7 @@ from panel.custom import JSComponent
 
 from apps.coupling import Coupling, cells
 from apps.goals import KINDS, MOST_GOALS, Aim, Bench, aims_of, gain_of
-from apps.pages.background import BackgroundPage
+from apps.pages.background import BackgroundPage, hand_over
 from apps.pages.live import (
     ADDRESS,
     FAULT,
@@ -31,13 +30,14 @@ from apps.pages.live import (
     _number,
     _paragraph,
     _text,
+    fill,
     page_template,
 )
 from apps.player import STYLE, Controls, script
 from apps.session import plain
 from apps.tuning import LOOK, OTHERWISE, TuneChoices
 from apps.weight_tables import weight_table
-from apps.work import WAITING, Lent, ends_with_the_server, processes
+from apps.work import WAITING, Lent, ends_with_the_server, get_ready, processes
 from nmss_lab.design import Design
 from nmss_lab.files import dumps
 from nmss_lab.matching import Match, match
@@ -50,6 +50,11 @@ from nmss_lab.tuning import Step, Tuned, attained, tune
 
 LOG = logging.getLogger(__name__)
 PATH, HEADING = "tune", "Tune"
+
+PARTS = (
+    *("lead", "alert", "goals", "legend", "grid"),
+    *("weights", "measures", "python", "controls"),
+)
 
 TOLD_EVERY = 0.2
 """Seconds between pictures of the best so far."""
@@ -150,7 +155,7 @@ class TunePage(WithForm, BackgroundPage):
         self._tell()
         if self.document is not None:
             ends_with_the_server(self, self.document)
-            pn.state.onload(_warm_up)
+            pn.state.onload(get_ready)
 
     def _open(self) -> None:
         """Begin with the choices of the address, or with the case as it is."""
@@ -197,15 +202,6 @@ class TunePage(WithForm, BackgroundPage):
         except ValueError:
             self.choices.accept(before)
             raise
-
-    def _accept(self, sent: dict[str, Any]) -> None:
-        choices = self.choices
-        if sent.pop("reset", False):
-            choices.take_case(choices.default_case)
-        elif sent.get("case") != choices.case:
-            choices.accept({"case": sent.get("case")})
-        else:
-            choices.accept(sent)
 
     def _renew(self) -> None:
         """Begin anew, or put the designs under new conditions, as choices ask for.
@@ -370,13 +366,10 @@ class TunePage(WithForm, BackgroundPage):
         if page == "receding_horizon":
             horizon = tuned.horizon
             more = f"&structures=tuned,before&Np={horizon.Np}&Nc={horizon.Nc}"
-        number = self.goals.leads.get("number", 0) + 1
-        self.goals.leads = {"to": f"{page}?case={name}{more}", "number": number}
+        hand_over(self.goals, "leads", to=f"{page}?case={name}{more}")
 
     def _save(self) -> None:
-        number = self.goals.saved.get("number", 0) + 1
-        text = dumps(self.present)
-        self.goals.saved = {"name": "design.json", "text": text, "number": number}
+        hand_over(self.goals, "saved", name="design.json", text=dumps(self.present))
 
     def _found(self) -> Design:
         if self.place.after is None:
@@ -544,8 +537,7 @@ class TunePage(WithForm, BackgroundPage):
         if K is None:
             raise ValueError("this case has no PIP design")
         text = "; ".join(", ".join(f"{x:.10g}" for x in row) for row in K)
-        number = self.goals.typed.get("number", 0) + 1
-        self.goals.typed = {"text": text, "number": number}
+        hand_over(self.goals, "typed", text=text)
 
     def _case_gain(self) -> Array | None:
         for design in self.choices.example.designs.values():
@@ -862,34 +854,9 @@ class TunePage(WithForm, BackgroundPage):
     def template(self) -> pn.Template:
         """Put the page together."""
         page = page_template(PATH, HEADING, list(self.figures))
-        for name in (
-            "lead",
-            "alert",
-            "goals",
-            "legend",
-            "grid",
-            "weights",
-            "measures",
-            "python",
-            "controls",
-        ):
-            page.add_panel(name, getattr(self, name))
-        for name, drawn in self.figures.items():
-            pane = pn.pane.Bokeh(drawn.figure, sizing_mode="stretch_both")
-            page.add_panel(f"chart_{name}", pane)
+        fill(page, self, PARTS, self.figures)
         self.served = True
         return page
-
-
-def _warm_up() -> None:
-    """Start the processes before they are asked for, so that Tune answers at once."""
-
-    def start() -> None:
-        pool = processes()
-        for _ in range(os.cpu_count() or 1):
-            pool.submit(attained, (), np.zeros(0))
-
-    WAITING.submit(start)
 
 
 def _reach(now: float, target: float) -> tuple[float, float]:
