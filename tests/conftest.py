@@ -6,8 +6,10 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
@@ -228,31 +230,62 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
 Open = Callable[..., Page]
 
 
-@pytest.fixture
-def visit(server: Server, browser: Browser) -> Iterator[Open]:
-    """Yield a function that opens a page; at the end nothing may have complained."""
+@contextmanager
+def watched(
+    server: Server, browser: Browser, ready: str, first: str = ""
+) -> Iterator[Open]:
+    """Give a function that opens pages; at the end none may have complained.
+
+    Nor may one have asked another host for anything.
+
+    Parameters
+    ----------
+    ready : str
+        Condition, in JavaScript, under which a page counts as opened.
+    first : str
+        Path that is opened where none is given.
+    """
     said: list[str] = []
     contexts = []
 
-    def open_page(path: str, width: int = 1440, height: int = 900, **more: Any) -> Page:
+    def asked(request: Any) -> None:
+        parts = urlsplit(request.url)
+        if parts.scheme not in ("data", "blob") and parts.hostname != "127.0.0.1":
+            said.append(request.url)
+
+    def open_page(
+        path: str = first,
+        width: int = 1440,
+        height: int = 900,
+        until: str = ready,
+        **more: Any,
+    ) -> Page:
         context = browser.new_context(
             viewport={"width": width, "height": height}, **more
         )
         contexts.append(context)
         page = context.new_page()
+        page.on("request", asked)
         page.on("pageerror", lambda error: said.append(str(error)))
         page.on(
             "console",
             lambda m: said.append(m.text) if m.type in ("error", "warning") else None,
         )
         page.goto(server.url + path)
-        page.wait_for_function("window.nmssPlayer?.frames > 0", timeout=60_000)
+        page.wait_for_function(until, timeout=60_000)
         return page
 
     yield open_page
     for context in contexts:
         context.close()
     assert said == []
+
+
+@pytest.fixture
+def visit(server: Server, browser: Browser) -> Iterator[Open]:
+    """Yield a function that opens a page with a player."""
+    with watched(server, browser, "window.nmssPlayer?.frames > 0") as open_page:
+        yield open_page
 
 
 def settled(page: Page) -> None:

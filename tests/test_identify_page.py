@@ -5,14 +5,13 @@ from __future__ import annotations
 import contextlib
 import io
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
-from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
-from conftest import ALGEBRA, Server
+from conftest import ALGEBRA, Open, Server, watched
 from playwright.sync_api import Browser, Page, expect
 
 from apps.identification import LARGEST, LOOK, RECORDS, IdentifyChoices, uploaded
@@ -297,39 +296,14 @@ def _file(found: Any) -> str:
 
 # --- In the browser ------------------------------------------------------------------
 
-Open = Callable[..., Page]
 DONE = "window.nmssIdentify?.rows() > 0 && !nmssIdentify.running() && nmssForm.idle()"
 
 
 @pytest.fixture
 def visit(server: Server, browser: Browser) -> Iterator[Open]:
     """Yield a function that opens the page; nothing may complain or call away."""
-    said: list[str] = []
-    contexts = []
-
-    def asked(request: Any) -> None:
-        parts = urlsplit(request.url)
-        if parts.scheme not in ("data", "blob") and parts.hostname != "127.0.0.1":
-            said.append(request.url)
-
-    def open_page(path: str = "identify", width: int = 1440, **more: Any) -> Page:
-        context = browser.new_context(viewport={"width": width, "height": 900}, **more)
-        contexts.append(context)
-        page = context.new_page()
-        page.on("request", asked)
-        page.on("pageerror", lambda error: said.append(str(error)))
-        page.on(
-            "console",
-            lambda m: said.append(m.text) if m.type in ("error", "warning") else None,
-        )
-        page.goto(server.url + path)
-        page.wait_for_function(DONE, timeout=60_000)
-        return page
-
-    yield open_page
-    for context in contexts:
-        context.close()
-    assert said == []
+    with watched(server, browser, DONE, "identify") as open_page:
+        yield open_page
 
 
 def choose(page: Page, name: str, value: str) -> None:

@@ -8,14 +8,14 @@ import dataclasses
 import io
 import json
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from conftest import Server
+from conftest import Open, Server, watched
 from playwright.sync_api import Browser, Page, expect
 
 from apps.pages.robustness import LOOK, RobustnessPage
@@ -316,7 +316,6 @@ def test_a_study_called_off_keeps_what_there_is() -> None:
 
 # --- In the browser ------------------------------------------------------------------
 
-Open = Callable[..., Page]
 DONE = "window.nmssStudy && nmssForm.idle() && !nmssStudy.running()"
 STUDIED = f"{DONE} && nmssStudy.shown() > 0"
 
@@ -324,27 +323,8 @@ STUDIED = f"{DONE} && nmssStudy.shown() > 0"
 @pytest.fixture
 def visit(server: Server, browser: Browser) -> Iterator[Open]:
     """Yield a function that opens the page; nothing may complain."""
-    said: list[str] = []
-    contexts = []
-
-    def open_page(path: str = "robustness", width: int = 1440, **more: Any) -> Page:
-        until = more.pop("until", STUDIED)
-        context = browser.new_context(viewport={"width": width, "height": 900}, **more)
-        contexts.append(context)
-        page = context.new_page()
-        page.on("pageerror", lambda error: said.append(str(error)))
-        page.on(
-            "console",
-            lambda m: said.append(m.text) if m.type in ("error", "warning") else None,
-        )
-        page.goto(server.url + path)
-        page.wait_for_function(until, timeout=60_000)
-        return page
-
-    yield open_page
-    for context in contexts:
-        context.close()
-    assert said == []
+    with watched(server, browser, STUDIED, "robustness") as open_page:
+        yield open_page
     assert server.faults() == []
 
 

@@ -5,15 +5,14 @@ from __future__ import annotations
 import contextlib
 import io
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
-from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
-from conftest import ALGEBRA, REPLAY, Server
+from conftest import ALGEBRA, REPLAY, Open, Server, watched
 from playwright.sync_api import Browser, Page, expect
 
 from apps.goals import KINDS, MOST_GOALS, Aim, aims_of, gain_of
@@ -376,39 +375,14 @@ def test_a_step_without_a_finite_value_has_no_picture() -> None:
 
 # --- In the browser ------------------------------------------------------------------
 
-Open = Callable[..., Page]
 READY = "window.nmssTune && window.nmssForm && nmssForm.idle() && nmssTune.idle()"
 
 
 @pytest.fixture
 def visit(server: Server, browser: Browser) -> Iterator[Open]:
     """Yield a function that opens the page; nothing may complain or call away."""
-    said: list[str] = []
-    contexts = []
-
-    def asked(request: Any) -> None:
-        parts = urlsplit(request.url)
-        if parts.scheme not in ("data", "blob") and parts.hostname != "127.0.0.1":
-            said.append(request.url)
-
-    def open_page(path: str = "tune", width: int = 1440, **more: Any) -> Page:
-        context = browser.new_context(viewport={"width": width, "height": 900}, **more)
-        contexts.append(context)
-        page = context.new_page()
-        page.on("request", asked)
-        page.on("pageerror", lambda error: said.append(str(error)))
-        page.on(
-            "console",
-            lambda m: said.append(m.text) if m.type in ("error", "warning") else None,
-        )
-        page.goto(server.url + path)
-        page.wait_for_function(READY, timeout=60_000)
-        return page
-
-    yield open_page
-    for context in contexts:
-        context.close()
-    assert said == []
+    with watched(server, browser, READY, "tune") as open_page:
+        yield open_page
 
 
 def press(page: Page, name: str) -> None:
