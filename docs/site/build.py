@@ -76,6 +76,9 @@ SECONDS = 300
 STYLES = re.compile(r"https://cdn\.holoviz\.org/panel/[^/]+/dist/([\w./-]+\.css)")
 """Style sheets of Panel's components, which are installed, too."""
 
+SERVED = "Part of the dashboard: it opens while make serve runs on this computer"
+"""What a link to the dashboard says where the pointer rests on it."""
+
 LOADING = "esms-options", "panel.models.browser.BrowserInfo"
 """Marks of what `panel.extension` shows, which loads scripts that a page has."""
 
@@ -145,6 +148,11 @@ def executed(path: Path) -> nbformat.NotebookNode:
 # --- Text -------------------------------------------------------------------------
 
 
+MATH = r'<span class="math">[^<]*</span>'
+BESIDE = re.compile(rf"[(\[]+{MATH}[^\s<]*|{MATH}[^\s<]+")
+"""An equation within a line, and what stands beside it without a space."""
+
+
 def slug(heading: str) -> str:
     """Return the anchor that a heading gets, as on GitHub."""
     plain = re.sub(r"<[^>]+>", "", heading).lower()
@@ -198,6 +206,8 @@ class Renderer(IPythonRenderer):
 
     def link(self, text: str, url: str, title: str | None = None) -> str:
         """Lead to the page that a file became; what has none is only named."""
+        if re.match(r"http://(127\.0\.0\.1|localhost)\b", url):
+            title = title or SERVED
         target = self.source.parent / url.partition("#")[0]
         if "solutions" in target.parts or (url[:1] != "#" and target.is_dir()):
             return text
@@ -221,8 +231,9 @@ class Renderer(IPythonRenderer):
 
 
 def text(source: str, renderer: Renderer) -> str:
-    """Return Markdown as HTML; wide tables scroll by themselves."""
+    """Return Markdown as HTML; wide tables scroll, and no line begins with a comma."""
     html = MarkdownWithMath(renderer).render(source)
+    html = BESIDE.sub(r'<span class="whole">\g<0></span>', html)
     html = re.sub(r"<table>", '<div class="wide"><table>', html)
     return html.replace("</table>", "</table></div>")
 
@@ -233,7 +244,8 @@ def text(source: str, renderer: Renderer) -> str:
 def shown(output: nbformat.NotebookNode) -> str:
     """Return one output of a cell as HTML."""
     if output.output_type == "stream":
-        return f"<pre class='printed'>{ansi2html(output.text)}</pre>"
+        columns = " columns" if re.search(r"\S {2,}\S", output.text) else ""
+        return f'<pre class="printed{columns}">{ansi2html(output.text)}</pre>'
     data = output.get("data", {})
     html = data.get("text/html", "")
     if "application/vnd.holoviews_load.v0+json" in data or not data:
