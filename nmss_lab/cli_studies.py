@@ -1,4 +1,4 @@
-"""The commands that take long, ``study`` and ``tune``, on processes or a cluster.
+"""Commands that take long: ``study``, ``tune``, ``report``; here or on a cluster.
 
 As in ``nmss_lab.cli``, what is numerical is imported inside the commands.
 """
@@ -35,16 +35,9 @@ def add_study(commands: Any) -> None:
         "study", help="run a case on many plants and count what goes wrong"
     )
     add = study.add_argument
-    add("case", help="its name, see nmss-lab simulate")
+    add("case", help="its name, see nmss-lab simulate, or a design file (.json)")
     add("--structure", nargs="+", metavar="NAME", help="all of the case by default")
-    add(
-        "--uncertainty",
-        choices=("covariance", "ranges", *LEVELS),
-        help="covariance of the case (default where it has one), ranges of the "
-        "coefficients, or draws or all corners of a stress level of Table 4.1",
-    )
-    for group, share in SHARES.items():
-        add(f"--{group}", type=float, help=f"range in per cent, {share:g} by default")
+    _add_uncertainty(study)
     add("-n", type=int, help="realisations: 1000, or all corners, by default")
     add("--seed", type=int, default=0, help="the same seed draws the same plants")
     add("--csv", metavar="FILE", help="write a row for each loop and output")
@@ -56,7 +49,7 @@ def add_tune(commands: Any) -> None:
     """Add the command ``tune``."""
     tune = commands.add_parser("tune", help="find weights that attain goals")
     add = tune.add_argument
-    add("case", help="its name, see nmss-lab simulate")
+    add("case", help="its name, see nmss-lab simulate, or a design file (.json)")
     add("--structure", metavar="NAME", help="the first of the case by default")
     add(
         "--goal",
@@ -75,6 +68,38 @@ def add_tune(commands: Any) -> None:
     tune.set_defaults(command=_tune)
 
 
+def add_report(commands: Any) -> None:
+    """Add the command ``report``."""
+    report = commands.add_parser(
+        "report", help="write a report of a design as one HTML file"
+    )
+    add = report.add_argument
+    add("design", help="file of a design or a study, see nmss_lab.files.save")
+    add("--out", metavar="FILE", help="by default the design's name with .html")
+    _add_uncertainty(report)
+    add(
+        "--realisations",
+        type=int,
+        metavar="N",
+        help="run it on N plants; with an uncertainty 1000, or all corners, by default",
+    )
+    add("--seed", type=int, default=0, help="the same seed draws the same plants")
+    _add_executor(report)
+    report.set_defaults(command=_report)
+
+
+def _add_uncertainty(command: Any) -> None:
+    add = command.add_argument
+    add(
+        "--uncertainty",
+        choices=("covariance", "ranges", *LEVELS),
+        help="covariance of the case (default where it has one), ranges of the "
+        "coefficients, or draws or all corners of a stress level of Table 4.1",
+    )
+    for group, share in SHARES.items():
+        add(f"--{group}", type=float, help=f"range in per cent, {share:g} by default")
+
+
 def _add_executor(command: Any) -> None:
     where = command.add_mutually_exclusive_group()
     where.add_argument(
@@ -89,6 +114,26 @@ def line(cells: Iterable[str]) -> str:
     """Return a line of a table: a name and columns of numbers."""
     first, *rest = cells
     return f"{first:<24}" + "".join(f"{cell:>12}" for cell in rest)
+
+
+def case_named(name: str) -> Case:
+    """Build the case of that name, or that of a design file: a name with .json."""
+    from nmss_lab.cases import case
+    from nmss_lab.files import case_of
+
+    if not name.endswith(".json"):
+        return case(name)
+    return case_of(_content(name), Path(name).name)
+
+
+def _content(file: str) -> Any:
+    """Content of a file; what is wrong with it is told with its name."""
+    from nmss_lab.files import load
+
+    try:
+        return load(file)
+    except ValueError as error:
+        raise ValueError(f"{file}: {error}") from error
 
 
 def designs_of(case: Case, names: Sequence[str] | None) -> dict[str, Any]:
@@ -114,6 +159,10 @@ def _say(text: str) -> None:
         print(text, file=sys.stderr, flush=True)
 
 
+def _say_done(done: int, asked: int) -> None:
+    _say(f"{done:,} of {asked:,}")
+
+
 def _end_of_progress() -> None:
     if sys.stderr.isatty():
         print(f"\r{'':<60}\r", end="", file=sys.stderr, flush=True)
@@ -124,11 +173,10 @@ def _end_of_progress() -> None:
 
 def _study(arguments: argparse.Namespace) -> int:
     """Run a study; print its rates and write its table, also after Ctrl-C."""
-    from nmss_lab.cases import case
     from nmss_lab.montecarlo import join
 
     _check_folder(arguments.csv)
-    chosen = case(arguments.case)
+    chosen = case_named(arguments.case)
     uncertainty, told = _uncertainty(chosen, arguments)
     parts: list[MonteCarlo] = []
     interrupted = False
@@ -169,7 +217,7 @@ def _collect(
             executor=executor,
         ):
             parts.append(part)
-            _say(f"{sum(map(len, parts)):,} of {part.asked:,}")
+            _say_done(sum(map(len, parts)), part.asked)
 
 
 def _uncertainty(case: Case, arguments: argparse.Namespace) -> tuple[Uncertainty, str]:
@@ -272,14 +320,13 @@ def _wish(text: str) -> tuple[str, float, bool, str]:
 
 def _tune(arguments: argparse.Namespace) -> int:
     """Tune a design; print goals and weights, and write it, also after Ctrl-C."""
-    from nmss_lab.cases import case
     from nmss_lab.files import save
     from nmss_lab.parallel import executor_for
     from nmss_lab.tuning import Trial, tune
     from nmss_lab.weights import Weights
 
     _check_folder(arguments.design)
-    chosen = case(arguments.case)
+    chosen = case_named(arguments.case)
     name = arguments.structure or next(iter(chosen.designs))
     design = designs_of(chosen, [name])[name]
     weights = Weights(design, per_step=arguments.per_step)
@@ -390,3 +437,48 @@ def _print_tuned(tuned: Tuned, stopped: str) -> None:
     for name, weight in tuned.weights.items():
         rows = np.array2string(weight, precision=5, suppress_small=True)
         print(f"{name:<24}" + rows.replace("\n", "\n" + 24 * " "))
+
+
+# --- Reports -----------------------------------------------------------------------
+
+
+def _report(arguments: argparse.Namespace) -> int:
+    """Write a report of a design file; after Ctrl-C of what was drawn until then."""
+    from nmss_lab.files import case_of, write
+    from nmss_lab.parallel import executor_for
+    from nmss_lab.report import report
+
+    design = Path(arguments.design)
+    out = Path(arguments.out or design.with_suffix(".html"))
+    _check_folder(str(out))
+    if out.absolute() == design.absolute():
+        raise ValueError(f"--out {out}: this is the design file itself")
+    content = _content(arguments.design)
+    chosen = case_of(content, design.name)
+    uncertainty, stated = None, ("realisations", "uncertainty", *SHARES)
+    if any(getattr(arguments, name) is not None for name in stated):
+        uncertainty, _ = _uncertainty(chosen, arguments)
+
+    with (
+        _until_interrupted() as interrupted,
+        executor_for(arguments.workers, arguments.cluster) as executor,
+    ):
+
+        def told(done: int, asked: int) -> bool:
+            _say_done(done, asked)
+            return bool(interrupted)
+
+        text = report(
+            content,
+            uncertainty=uncertainty,
+            realisations=arguments.realisations,
+            seed=arguments.seed,
+            title=f"Report of {design.name}",
+            executor=executor,
+            callback=told,
+        )
+    _end_of_progress()
+    write(out, text)
+    print(chosen.title, *chosen.notes, sep="\n- ")
+    print(f"written: {out}, {len(text.encode()) / 1000.0:.0f} kB")
+    return INTERRUPTED if interrupted else 0

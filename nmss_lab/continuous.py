@@ -182,7 +182,10 @@ class ContinuousPlant:
         channels = _table("channels", self.channels)
         none: Channels = tuple(() for _ in channels)
         given = self.disturbance_channels
-        disturbances = none if given is None else _table("disturbance_channels", given)
+        if given in (None, none):  # the latter in a copy, or from a file
+            disturbances = none
+        else:
+            disturbances = _table("disturbance_channels", given)
         if len(disturbances) != len(channels):
             raise ValueError(
                 f"disturbance_channels has {len(disturbances)} rows; expected "
