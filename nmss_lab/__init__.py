@@ -10,12 +10,13 @@ from nmss_lab.analysis import (
     review,
 )
 from nmss_lab.cases import CASES, Case, case
+from nmss_lab.comparison import Score, compare
 from nmss_lab.continuous import ContinuousPlant, TransferFunction, difference_model
 from nmss_lab.controller import Controller, Limits, Memory, Move, Status
 from nmss_lab.convergence import Examination, examine
 from nmss_lab.design import Design
 from nmss_lab.governor import governor
-from nmss_lab.matching import Match, match
+from nmss_lab.matching import Match, equal_speed, match
 from nmss_lab.models import DifferenceModel, LinearPlant, Plant
 from nmss_lab.montecarlo import MonteCarlo, monte_carlo, monte_carlo_parts
 from nmss_lab.mpc import (
@@ -85,6 +86,7 @@ __all__ = [
     "Run",
     "Sampler",
     "Scenario",
+    "Score",
     "Settling",
     "StateDependentModel",
     "Status",
@@ -96,10 +98,12 @@ __all__ = [
     "case",
     "closed_loop",
     "closed_loops",
+    "compare",
     "control_polynomials",
     "difference_model",
     "disturbance_augmented",
     "disturbance_direct",
+    "equal_speed",
     "examine",
     "forward_path",
     "governor",

@@ -13,9 +13,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
+import scipy.linalg
+import scipy.optimize
 
 from nmss_lab.controller import Controller
 from nmss_lab.models import (
@@ -27,10 +29,23 @@ from nmss_lab.models import (
 )
 from nmss_lab.predictive import PredictiveController
 
-Transfer = Literal["T", "S_i", "S_o"]
+Transfer = Literal["T", "S_i", "S_o", "T_o"]
 
 ROUNDING = 1e-8
 """A pole this close to the unit circle counts as on it."""
+
+OFFSET_FREE = 1e-6
+"""Errors below this after a unit step count as none."""
+
+NEAR = 1e-6
+"""Frequencies this close to a pole are looked at one by one: it may cancel."""
+
+
+class Peak(NamedTuple):
+    """Largest gain over all frequencies up to Nyquist's, and where, in rad/s."""
+
+    gain: float
+    omega: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,19 +93,39 @@ class LinearLoop:
         The forward path keeps every open-loop pole of its model as a hidden mode: they
         cancel in T(z) when the model is exact, and come to light with a disturbance.
         """
-        B = np.hstack(list(self.B_r))
         left = list(self.poles)
-        for pole in np.linalg.eigvals(minimal_realisation(self.A, B, self.C)[0]):
+        for pole in self.poles_of("T"):
             left.pop(int(np.argmin(np.abs(np.array(left) - pole))))
         hidden = np.array(left)
         # Histories put many poles at the origin, which rounding spreads by up to 0.02.
         return hidden[np.abs(hidden) > 0.05]
 
+    def poles_of(self, which: Transfer) -> Array:
+        """Poles that one transfer shows: those its input reaches and y tells of."""
+        B = np.hstack(list(self.B_r)) if which == "T" else self._input(which, 1.0)
+        return np.linalg.eigvals(minimal_realisation(self.A, B, self.C)[0])
+
+    def comes_to_rest(self, which: Transfer) -> bool:
+        """Whether the response to a step of that input settles, hidden modes aside."""
+        poles = self.poles_of(which)
+        return float(np.abs(poles).max(initial=0.0)) < 1.0 - ROUNDING
+
+    def offset(self, which: Transfer) -> float:
+        """Error that a unit step leaves, the largest entry; inf if y never settles.
+
+        T(1) - I of a reference, S_i(1) and S_o(1) of disturbances.
+        """
+        if not self.comes_to_rest(which):
+            return np.inf
+        wanted = np.eye(len(self.C)) if which in ("T", "T_o") else 0.0
+        return float(np.abs(self.transfer(which, 1.0) - wanted).max())
+
     def transfer(self, which: Transfer, z: complex) -> Array:
         """Transfer matrix at ``z``: "T" from r, "S_i" from d_u, "S_o" from d_y to y.
 
-        (4.18), (4.20), (4.21) and (6.5)-(6.7) for every structure.  A pole at ``z``
-        that cancels is left out; one that does not gives infinite entries.
+        (4.18), (4.20), (4.21) and (6.5)-(6.7) for every structure; "T_o" is the
+        complementary sensitivity I - S_o.  A pole at ``z`` that cancels is left out;
+        one that does not gives infinite entries.
         """
         B = self._input(which, z)
         direct = np.eye(len(self.C)) if which == "S_o" else 0.0
@@ -99,16 +134,78 @@ class LinearLoop:
 
     def frequency_response(self, which: Transfer, omega: Array) -> Array:
         """Transfer matrices (len(omega), n_y, .) at angular frequencies in rad/s."""
-        points = np.exp(1j * np.asarray(omega) * self.dt)
-        return np.stack([self.transfer(which, z) for z in points])
+        triangle, basis = self._schur
+        rows, left = self.C @ basis, basis.conj().T
+        direct = np.eye(len(self.C)) if which == "S_o" else 0.0
+        size, found = np.eye(len(triangle)), []
+        for z in np.exp(1j * np.asarray(omega) * self.dt):
+            if np.abs(np.diag(triangle) - z).min() < NEAR:
+                found.append(self.transfer(which, z))
+                continue
+            B = left @ self._input(which, z)
+            solved = scipy.linalg.solve_triangular(z * size - triangle, B)
+            found.append(rows @ solved + direct)
+        return np.stack(found)
+
+    def singular_values(self, which: Transfer, omega: Array) -> Array:
+        """Gains (len(omega), .) at angular frequencies in rad/s, the largest first.
+
+        Of one output and one input the modulus of the frequency response; of several
+        they depend on the units of the signals.
+        """
+        response = self.frequency_response(which, omega)
+        there = np.array([np.isfinite(each).all() for each in response])
+        gains = np.linalg.svd(np.where(there[:, None, None], response, 0.0))[1]
+        return np.where(there[:, None], gains, np.inf)
+
+    def peak(self, which: Transfer) -> Peak:
+        """Largest singular value over all frequencies: the norm of the transfer.
+
+        Infinite where its response does not come to rest.
+        """
+        nyquist, poles = np.pi / self.dt, self.poles_of(which)
+        if not self.comes_to_rest(which):
+            worst = poles[np.argmax(np.abs(poles))]
+            return Peak(np.inf, float(np.abs(np.angle(worst))) / self.dt)
+        own = np.log(poles[np.abs(poles) > 0.3]) / self.dt  # where it may resonate
+        own = np.clip(np.concatenate([np.abs(own), np.abs(own.imag)]), 0.0, nyquist)
+        omega = np.union1d(np.geomspace(1e-4, 1.0, 200) * nyquist, own[own > 0.0])
+
+        def negative(log_omega: float) -> float:
+            at = np.exp([log_omega])
+            return -float(self.singular_values(which, at)[0, 0])
+
+        best = Peak(0.0, 0.0)
+        gains = self.singular_values(which, omega)[:, 0]
+        inner = np.pad(gains, 1, constant_values=-1.0)
+        tops = np.flatnonzero((gains >= inner[:-2]) & (gains >= inner[2:]))
+        for top in tops[np.argsort(gains[tops])][-3:]:
+            best = max(best, Peak(float(gains[top]), float(omega[top])))
+            low, high = omega[max(top - 1, 0)], omega[min(top + 1, len(omega) - 1)]
+            found = scipy.optimize.minimize_scalar(
+                negative,
+                bounds=(float(np.log(low)), float(np.log(high))),
+                method="bounded",
+                options={"xatol": 1e-8},
+            )
+            best = max(best, Peak(-float(found.fun), float(np.exp(found.x))))
+        return best
+
+    @cached_property
+    def _schur(self) -> tuple[Array, Array]:
+        """Triangular form and its basis: one for all frequencies."""
+        triangle, basis = scipy.linalg.schur(self.A, output="complex")
+        return triangle, basis
 
     def _input(self, which: Transfer, z: complex) -> Array:
         if which == "S_i":
             return self.B_u
         if which == "S_o":
             return self.B_y
+        if which == "T_o":
+            return -self.B_y
         if which != "T":
-            raise ValueError(f'which = "{which}": expected "T", "S_i" or "S_o"')
+            raise ValueError(f'which = "{which}": expected "T", "S_i", "S_o" or "T_o"')
         ahead = z ** np.arange(len(self.B_r))
         return np.tensordot(ahead, self.B_r, axes=1)
 
@@ -308,17 +405,20 @@ def _stability(loop: LinearLoop) -> Finding:
 def _offset(loop: LinearLoop) -> list[Finding]:
     if loop.radius > 1.0 + ROUNDING:
         return [Finding("offset", "note", "Not looked at: the loop is unstable.")]
-    cases: list[tuple[Transfer, str, Array | float]] = [
-        ("T", "a constant reference", np.eye(len(loop.C))),
-        ("S_i", "a constant disturbance at the input", 0.0),
-        ("S_o", "a constant disturbance at the output", 0.0),
+    cases: list[tuple[Transfer, str]] = [
+        ("T", "a constant reference"),
+        ("S_i", "a constant disturbance at the input"),
+        ("S_o", "a constant disturbance at the output"),
     ]
     findings = []
-    for which, what, wanted in cases:
-        error = float(np.abs(loop.transfer(which, 1.0) - wanted).max())
-        if error < 1e-6:
+    for which, what in cases:
+        error = loop.offset(which)
+        if error < OFFSET_FREE:
             sentence = f"No offset remains after {what} ({which}(1) as it should be)."
             findings.append(Finding("offset", "good", sentence))
+        elif np.isinf(error):
+            sentence = f"After {what} the output never comes to rest."
+            findings.append(Finding("offset", "bad", sentence))
         else:
             sentence = f"{which}(1) is off by {error:.3g}: {what} leaves an offset."
             findings.append(Finding("offset", "bad", sentence))

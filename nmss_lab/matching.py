@@ -1,8 +1,9 @@
 """Inverse optimality: predictive control that feels like a loop one already has.
 
-The weights are sought for which the unconstrained law of a predictive design is a given
-proportional-integral-plus (PIP) law; then limits can be added, and nothing changes
-while none of them is near.
+``match`` seeks the weights for which the unconstrained law of a predictive design is a
+given proportional-integral-plus (PIP) law; then limits can be added, and nothing
+changes while none of them is near.  ``equal_speed`` asks for less: another structure
+that is as fast, so that the two can be compared.
 """
 
 from __future__ import annotations
@@ -16,8 +17,10 @@ import numpy as np
 import scipy.optimize
 
 from nmss_lab.analysis import ControlPolynomials, control_polynomials, linear_loop
+from nmss_lab.controller import Limits
 from nmss_lab.design import Design
 from nmss_lab.models import Array, DifferenceModel
+from nmss_lab.mpc import STRUCTURES, state_weight
 from nmss_lab.nmss import integral_of_error_form
 from nmss_lab.parallel import in_order
 from nmss_lab.pip import gain, pip
@@ -224,3 +227,119 @@ def _entries(matrix: Array) -> Array:
     floor = max(1e-3 * sizes[-1], 1e-3)
     L = np.linalg.cholesky(axes * np.maximum(sizes, floor) @ axes.T)
     return L[np.tril_indices(len(L))]
+
+
+FACTORS = np.geomspace(1e-5, 1e5, 11)
+"""Factors on R that bracket the one which gives a wanted rise."""
+
+LONGEST = 1000
+"""Samples within which a loop has to rise."""
+
+
+def equal_speed(design: Design, structure: str) -> Design:
+    """Turn a predictive design into one of another structure that is as fast.
+
+    Structures that weigh predicted errors and moves take the weights over: without
+    limits, on the model, they are the same law.  From these to "integral_of_error" and
+    back the weight of the outputs is kept, and R multiplied by the factor for which
+    outputs rise on the model as fast as before, each for a step of its own reference,
+    in the mean; where none does, by the one which comes nearest.  The sum of the error
+    weighs 0.3 of the outputs, over that factor, and past inputs nothing.
+
+    Parameters
+    ----------
+    design : Design
+        Of a predictive structure, on a difference equation.
+    structure : str
+        A name in ``nmss_lab.mpc.STRUCTURES``.
+
+    Raises
+    ------
+    ValueError
+        If either structure is another, the new one does not suit the model, or the
+        design's outputs do not rise.
+    """
+    model = design.model
+    for name in (design.structure, structure):
+        if name not in STRUCTURES:
+            raise ValueError(
+                f'structure = "{name}": expected one of {", ".join(STRUCTURES)}'
+            )
+    assert isinstance(model, DifferenceModel)  # as the structure is predictive
+    if structure == design.structure:
+        return design
+    STRUCTURES[structure](model, design.horizon, 1.0, 1.0)  # whether it suits the model
+    sums = "integral_of_error"
+    if sums not in (structure, design.structure):
+        return dataclasses.replace(design, structure=structure, options={})
+    size = integral_of_error_form(model).n_x if design.structure == sums else model.n_y
+    Q = weight("Q", design.Q, design.horizon.Np, size)[: model.n_y, : model.n_y]
+    R = weight("R", design.R, design.horizon.Nc, model.n_u)[: model.n_u, : model.n_u]
+
+    def made(log_factor: float) -> Design:
+        factor = np.exp(log_factor)
+        if structure == sums:
+            weights = state_weight(model, Q / model.na, 0.0, 0.3 / factor * Q)
+        else:
+            weights = model.na * Q
+        return dataclasses.replace(
+            design,
+            structure=structure,
+            Q=weights,
+            R=factor * R,
+            reference="zero" if structure == sums else "held",
+            options={},
+        )
+
+    wanted = _rise(design)
+    if not np.isfinite(wanted):
+        raise ValueError(
+            f"the design's outputs do not rise within {LONGEST} samples on the model: "
+            "there is no speed to be equal to"
+        )
+
+    def slower(log_factor: float) -> float:
+        return _rise(made(log_factor)) - wanted
+
+    logs = np.log(FACTORS)
+    missed = np.array([slower(x) for x in logs])
+    turns = np.flatnonzero((missed[:-1] < 0.0) & (missed[1:] >= 0.0))
+    if len(turns):
+        low, high = (float(logs[turns[0] + i]) for i in (0, 1))
+        best = float(scipy.optimize.brentq(slower, low, high, xtol=1e-4))
+    elif np.isfinite(missed).any():
+        best = float(logs[np.nanargmin(np.abs(missed))])
+    else:
+        raise ValueError(f"{structure} does not rise on the model with any R")
+    return made(best)
+
+
+def _rise(design: Design) -> float:
+    """Mean rise time of the outputs on the model without limits, or nan."""
+    model = design.model
+    assert isinstance(model, DifferenceModel)
+    try:
+        controller = dataclasses.replace(design, limits=Limits()).build()
+    except (ValueError, np.linalg.LinAlgError):
+        return np.nan
+    loop = linear_loop(controller)
+    if not loop.is_stable:
+        return np.nan
+    state = np.zeros((len(loop.A), model.n_y))
+    by_r, done = loop.B_r.sum(axis=0), []
+    for _ in range(LONGEST):
+        done.append(np.diag(loop.C @ state))
+        if (np.array(done) >= 0.9).any(axis=0).all():
+            break
+        state = loop.A @ state + by_r
+    rises = [_reach(y, 0.9) - _reach(y, 0.1) for y in np.array(done).T]
+    return float(np.mean(rises)) * model.dt
+
+
+def _reach(y: Array, level: float) -> float:
+    """First time, in samples, at which a response from zero is at a level."""
+    beyond = np.flatnonzero(y >= level)
+    if not beyond.size:
+        return np.nan
+    k = int(beyond[0])
+    return float(k - (y[k] - level) / (y[k] - y[k - 1]))

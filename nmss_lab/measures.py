@@ -128,10 +128,13 @@ def measures(run: Run, channel: int = 0) -> Measures:
     )
 
 
-def steps(run: Run, channel: int = 0) -> tuple[StepMeasures, ...]:
+def steps(
+    run: Run, channel: int = 0, until: int | None = None
+) -> tuple[StepMeasures, ...]:
     """Measure each change of the reference of output number ``channel``.
 
-    The output at the start is taken as the reference before the first sample.
+    The output at the start is taken as the reference before the first sample; what
+    happens from sample ``until`` on is left out.
 
     Raises
     ------
@@ -139,13 +142,69 @@ def steps(run: Run, channel: int = 0) -> tuple[StepMeasures, ...]:
         If the run has no such output.
     """
     _check_channel(run, channel)
-    r = run.r[:, channel]
+    r = run.r[:until, channel]
     before = np.concatenate([run.y[:1, channel], r[:-1]])
     changes = np.flatnonzero(np.abs(r - before) > 1e-12)
     return tuple(
         _step(run, channel, int(k), int(end), float(before[k]))
         for k, end in itertools.pairwise([*changes, len(r)])
     )
+
+
+def iae(run: Run, channel: int = 0, first: int = 0, until: int | None = None) -> float:
+    """Integral of the absolute error of an output from sample ``first`` on.
+
+    What happens from sample ``until`` on is left out.
+
+    Raises
+    ------
+    ValueError
+        If the run has no such output.
+    """
+    _check_channel(run, channel)
+    last = len(run) if until is None else until
+    r = np.repeat(run.r[first:last, channel], _points(run))
+    return _integral(run, np.abs(r - run.y_fine[_window(run, first, last), channel]))
+
+
+def rejection(
+    run: Run, first: int, channel: int = 0, input: int = 0
+) -> dict[str, float]:
+    """Measure how a run copes with what happens from sample ``first`` on.
+
+    Parameters
+    ----------
+    run : Run
+    first : int
+        Sample from which on it is measured, such as that of a disturbance.
+    channel, input : int
+        Which output and which input.
+
+    Returns
+    -------
+    dict of str to float
+        "peak", the largest absolute error of the output, "IAE", its integral, and
+        "travel", the sum of the absolute changes of the input.
+
+    Raises
+    ------
+    ValueError
+        If the run has no such sample, output or input.
+    """
+    _check_channel(run, channel)
+    for name, value, size in (
+        ("first", first, len(run)),
+        ("input", input, run.u.shape[1]),
+    ):
+        if not 0 <= value < size:
+            raise ValueError(f"{name} = {value}: expected 0 to {size - 1}")
+    r = np.repeat(run.r[first:, channel], _points(run))
+    error = np.abs(r - run.y_fine[_window(run, first, len(run)), channel])
+    return {
+        "peak": float(error.max()),
+        "IAE": iae(run, channel, first),
+        "travel": float(np.abs(run.du[first:, input]).sum()),
+    }
 
 
 def violations(run: Run, limits: Limits | None = None) -> dict[str, Violations]:

@@ -405,6 +405,16 @@ def minimal_realisation(A: Array, B: Array, C: Array) -> tuple[Array, Array, Arr
     return W.T @ A @ W, W.T @ B, C @ W
 
 
+def observable_part(plant: LinearPlant) -> LinearPlant:
+    """Plant without the states that no output shows at any sample.
+
+    A plant sampled from transfer functions carries a mode once for each channel that
+    has it; the outputs show only some sum of them.
+    """
+    W = reachable_basis(plant.A.T, plant.C.T)
+    return LinearPlant(W.T @ plant.A @ W, W.T @ plant.B, plant.C @ W, dt=plant.dt)
+
+
 def reachable_basis(A: Array, B: Array, tolerance: float = 1e-8) -> Array:
     """Orthonormal basis (n_x, rank) of the states that inputs can reach.
 

@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+import scipy.linalg
 from conftest import ALGEBRA, REPLAY
 from strategies import random_model
 
@@ -11,7 +12,7 @@ from nmss_lab.analysis import control_polynomials, linear_loop, review
 from nmss_lab.cases import case
 from nmss_lab.controller import Limits
 from nmss_lab.governor import governor
-from nmss_lab.models import DifferenceModel
+from nmss_lab.models import DifferenceModel, minimal_realisation
 from nmss_lab.mpc import (
     STRUCTURES,
     forward_path,
@@ -329,3 +330,92 @@ def test_what_has_no_polynomials_says_so():
         control_polynomials(controller)
     with pytest.raises(ValueError, match='which = "S"'):
         linear_loop(controller).transfer("S", 1.0)
+
+
+# --- Gains over frequency ------------------------------------------------------------
+
+
+def reaches(A, B, C, D, gain):
+    """Return whether a singular value equals ``gain`` at some frequency.
+
+    It does where a symplectic pencil has eigenvalues on the unit circle.
+    """
+    R = np.linalg.inv(gain**2 * np.eye(B.shape[1]) - D.T @ D)
+    drift = A + B @ R @ D.T @ C
+    weight = C.T @ (np.eye(len(C)) + D @ R @ D.T) @ C
+    I, O = np.eye(len(A)), np.zeros_like(A)  # noqa: E741
+    left = np.block([[drift, B @ R @ B.T], [O, I]])
+    right = np.block([[I, O], [weight, drift.T]])
+    found = np.abs(scipy.linalg.eigvals(left, right))
+    return bool((np.abs(found - 1.0) < 1e-7).any())
+
+
+@pytest.mark.parametrize("structure", STRUCTURES)
+@pytest.mark.parametrize("which", ["S_i", "S_o", "T_o"])
+def test_peak_is_the_norm_of_the_transfer(rng, structure, which):
+    """Some frequency reaches a little less, none a little more."""
+    model = random_model(rng, 2, 2, 1, 2, 2, 2, radius=0.8)
+    plant = model.varied(numerator=1.1, denominator=0.98)
+    loop = linear_loop(STRUCTURES[structure](model, Horizon(10, 3), 1.0, 0.5), plant)
+    B, D = {
+        "S_i": (loop.B_u, np.zeros((2, 2))),
+        "S_o": (loop.B_y, np.eye(2)),
+        "T_o": (-loop.B_y, np.zeros((2, 2))),
+    }[which]
+    gain, omega = loop.peak(which)
+    A, B, C = minimal_realisation(loop.A, B, loop.C)
+    # the ends of the frequency axis are approached, not reached
+    assert reaches(A, B, C, D, gain * (1 - 1e-4))
+    assert not reaches(A, B, C, D, gain * (1 + 1e-4))
+    at_peak = loop.singular_values(which, np.array([omega]))[0, 0]
+    assert at_peak == pytest.approx(gain, rel=ROUND)
+
+
+@pytest.mark.parametrize("name", ["shell_5_3_2", "wood_berry", "gasifier_6_3_4"])
+def test_response_over_frequency_is_that_at_each_point(name):
+    """One triangular form for all frequencies, and one solution a frequency, agree."""
+    example = case(name)
+    for design in example.designs.values():
+        loop = linear_loop(design.build(), example.plant)
+        omega = np.geomspace(1e-4, 1.0, 15) * np.pi / loop.dt
+        for which in ("T", "S_i", "S_o", "T_o"):
+            found = loop.frequency_response(which, omega)
+            points = np.exp(1j * omega * loop.dt)
+            wanted = np.stack([loop.transfer(which, z) for z in points])
+            assert near(found, wanted)
+            sizes = np.linalg.norm(wanted, 2, axis=(1, 2))
+            assert near(loop.singular_values(which, omega)[:, 0], sizes)
+
+
+def test_sensitivity_and_its_complement_add_up(rng):
+    """S_o + T_o = I, at any point."""
+    model, plant = plants(rng)
+    loop = linear_loop(forward_path(model, Horizon(12, 4), 1.0, 0.5), plant)
+    for z in POINTS:
+        total = loop.transfer("S_o", z) + loop.transfer("T_o", z)
+        assert near(total, np.eye(2))
+
+
+def test_modes_on_the_circle_count_where_they_are_seen():
+    """A forward path over (6.10): S_o is finite, an input disturbance never ends."""
+    model = DifferenceModel([-1.7, 1.0], [-1.0, 2.0])
+    loop = linear_loop(forward_path(model, Horizon(20, 5), 1 / 20, 1 / 5))
+    assert not loop.is_stable
+    assert loop.comes_to_rest("S_o")
+    assert loop.peak("S_o").gain < 3.0
+    assert not loop.comes_to_rest("S_i")
+    gain, omega = loop.peak("S_i")
+    assert gain == np.inf
+    assert omega == pytest.approx(np.arccos(0.85))  # z^2 - 1.7 z + 1 = 0
+    assert loop.offset("S_o") < ROUND
+    assert loop.offset("S_i") == np.inf
+
+
+def test_offset_is_what_a_long_run_leaves():
+    """An integrator behind a forward path: a constant push leaves a constant error."""
+    tank = DifferenceModel([-1.0], [0.1])
+    controller = forward_path(tank, Horizon(15, 4), 1.0, 0.1)
+    push = Scenario(np.zeros(400), input_disturbance=np.ones(400))
+    left = closed_loop(tank, controller, push).y[-1, 0]
+    assert linear_loop(controller).offset("S_i") == pytest.approx(abs(left), rel=1e-6)
+    assert linear_loop(controller).offset("T") < ROUND

@@ -166,3 +166,55 @@ def test_errors_name_the_argument(
     """What cannot be matched is refused with a sentence."""
     with pytest.raises(ValueError, match=message):
         lab.match(K, design(MODEL, structure), **options)
+
+
+# --- Other structures of the same speed ---------------------------------------------
+
+
+def rise(found: lab.Design) -> float:
+    """Return the mean rise time on the model, each output for its own reference."""
+    model, times = found.model, []
+    free = dataclasses.replace(found, limits=lab.Limits())
+    for output in range(model.n_y):
+        scenario = lab.Scenario(np.tile(np.eye(model.n_y)[output], (200, 1)))
+        run = lab.closed_loop(model, free.build(), scenario)
+        times.append(lab.measures.steps(run, output)[0].rise)
+    return float(np.mean(times))
+
+
+@pytest.mark.parametrize("model", [LAG, TWO], ids=["a lag", "two inputs"])
+def test_sums_and_increments_become_equally_fast(model: lab.DifferenceModel) -> None:
+    """From moves to the sum of the error and back, outputs rise as before."""
+    first = dataclasses.replace(
+        design(model, "wang_young", limits=lab.Limits(u=(-2.0, 2.0))), R=0.01
+    )
+    other = lab.equal_speed(first, "integral_of_error")
+    assert other.limits is first.limits
+    assert other.horizon is first.horizon
+    # the factor is sought to 1e-4 of itself, and rise follows it less than linearly
+    assert rise(other) == pytest.approx(rise(first), rel=1e-3)
+    back = lab.equal_speed(other, "forward_path")
+    assert rise(back) == pytest.approx(rise(first), rel=1e-3)
+
+
+@pytest.mark.parametrize("structure", ["forward_path", "minimal"])
+def test_structures_with_the_same_cost_are_one_law_on_the_model(structure: str) -> None:
+    """They take over the weights, and respond alike without limits."""
+    first = design(TWO, "wang_young")
+    other = lab.equal_speed(first, structure)
+    ours, theirs = (
+        lab.closed_loop(TWO, d.build(), lab.Scenario(np.ones((40, 2)))).y
+        for d in (other, first)
+    )
+    assert relative(ours, theirs) < DECISION
+
+
+def test_what_has_no_equal_says_so() -> None:
+    """Unknown structures, and those that need a measured disturbance, are named."""
+    with pytest.raises(ValueError, match="pip"):
+        lab.equal_speed(design(LAG, "wang_young"), "pip")
+    with pytest.raises(ValueError, match=r"model\.g is missing"):
+        lab.equal_speed(design(LAG, "wang_young"), "disturbance_direct")
+    slow = dataclasses.replace(design(LAG, "wang_young"), Q=0.0)
+    with pytest.raises(ValueError, match="do not rise"):
+        lab.equal_speed(slow, "integral_of_error")

@@ -11,7 +11,7 @@ from conftest import ALGEBRA
 from nmss_lab import cases
 from nmss_lab.controller import Limits
 from nmss_lab.design import Design
-from nmss_lab.measures import measures, steps, table, violations
+from nmss_lab.measures import iae, measures, steps, table, violations
 from nmss_lab.models import DifferenceModel
 from nmss_lab.predict import Horizon
 from nmss_lab.simulate import Run, Scenario, closed_loop
@@ -158,3 +158,21 @@ def test_measures_of_every_case_are_numbers() -> None:
         for channel in range(run.y.shape[1]):
             found = measures(run, channel)
             assert np.isfinite([found.iae, found.ise, found.coupling]).all()
+
+
+def test_windows_end_where_they_are_told_to() -> None:
+    """A disturbance from sample 3 on is left out of a step, and measured alone."""
+    run = made_up([1.0] * 6, [0.0, 0.5, 1.0, 1.4, 1.2, 1.0])
+    (step,) = steps(run, until=3)
+    assert step.overshoot == 0.0
+    assert step.settling == pytest.approx(4.0)
+    assert step.iae == pytest.approx(2.0 * 1.5)
+    assert iae(run, until=3) == pytest.approx(2.0 * 1.5)
+    assert iae(run, first=3) == pytest.approx(2.0 * 0.6)
+    assert iae(run) == pytest.approx(measures(run).iae)
+    assert steps(run, until=0) == ()
+    fine = [0.0, 1.0, 1.0, 1.0, 3.0, 1.0]
+    between = made_up([1.0] * 3, [0.0, 1.0, 1.0], fine)
+    assert iae(between, first=2) == pytest.approx(2.0 * 2.0 / 2.0)
+    with pytest.raises(ValueError, match="channel = 1"):
+        iae(run, 1)
