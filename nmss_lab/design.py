@@ -80,6 +80,11 @@ class Design:
         options = dict(self.options)
         if isinstance(self.model, StateDependentModel):
             return self._build_varying(self.model, options)
+        if self.structure in ("pip", "governor") and "K" not in options:
+            raise ValueError(
+                f'structure = "{self.structure}": options have no gain "K"; lq_gain '
+                "and pole_gain find one"
+            )
         if self.structure == "pip":
             return pip(self.model, limits=self.limits, **options)
         if self.structure == "governor":

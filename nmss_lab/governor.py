@@ -9,6 +9,7 @@ as the limits allow:
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from numbers import Real
 from typing import Literal
 
 import numpy as np
@@ -140,8 +141,8 @@ def governor(
     free = Np if free_until is None else free_until
     if not 1 <= free <= Np:
         raise ValueError(f"free_until = {free_until}: expected 1 to Np = {Np} steps")
-    if not 0.0 < decay <= 1.0:
-        raise ValueError(f"decay = {decay}: expected 0 < decay <= 1")
+    if not isinstance(decay, Real) or not 0.0 < decay <= 1.0:
+        raise ValueError(f"decay = {decay!r}: expected a number, 0 < decay <= 1")
     if decay < 1.0:  # what has faded to a millionth no longer counts
         free = min(free, 1 + int(np.log(1e-6) / np.log(decay)))
     if reference not in ("held", "preview"):

@@ -214,11 +214,14 @@ def check_poles(poles: Sequence[complex], n_x: int) -> Array:
     ValueError
         If their number is not n_x or pairs are incomplete.
     """
-    wanted = np.asarray(poles, dtype=complex)
+    try:
+        wanted = np.asarray(poles, dtype=complex)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"poles = {poles!r}: expected {n_x} numbers") from error
     if wanted.shape != (n_x,):
         raise ValueError(
-            f"poles has {wanted.size} entries, expected {n_x}: n_y (na + 1) + "
-            "n_u (nb - 1)"
+            f"poles has shape {wanted.shape}, expected ({n_x},): n_y (na + 1) + "
+            "n_u (nb - 1) numbers"
         )
     if not np.isfinite(wanted).all() or np.abs(np.poly(wanted).imag).max() > 1e-9:
         raise ValueError(

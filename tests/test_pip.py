@@ -67,7 +67,7 @@ def test_repeated_poles_are_placed(rng, sizes):
 @pytest.mark.parametrize(
     ("model", "poles", "message"),
     [
-        (MODEL, [0.1, 0.2], "poles has 2 entries, expected 4"),
+        (MODEL, [0.1, 0.2], r"poles has shape \(2,\), expected \(4,\)"),
         (MODEL, [0.1, 0.2, 0.3, 0.4j], "conjugate pairs"),
         (
             DifferenceModel([-1.4, 0.45], [0.3, -0.27]),

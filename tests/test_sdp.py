@@ -271,7 +271,7 @@ def test_use_and_pickle_change_nothing(build):
         ({}, "give either poles, or both weights Q and R"),
         ({"Q": 1.0}, "give either poles"),
         ({"poles": DEADBEAT, "Q": 1.0, "R": 1.0}, "give either poles"),
-        ({"poles": (0.0,)}, "poles has 1 entries, expected 2"),
+        ({"poles": (0.0,)}, r"poles has shape \(1,\), expected \(2,\)"),
         ({"poles": (0.1j, 0.2)}, "conjugate pairs"),
         ({"poles": DEADBEAT, "largest_gain": 0.0}, "largest_gain = 0.0"),
         ({"Q": [1.0, 2.0, 3.0], "R": 1.0}, "Q has shape"),
