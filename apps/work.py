@@ -29,10 +29,16 @@ from bokeh.document import Document
 WAITING = ThreadPoolExecutor(max_workers=8, thread_name_prefix="waiting")
 """One thread for each study or search of all sessions; more of them wait."""
 
-PROCESSES = min(os.cpu_count() or 1, 4)
+MOST = min(os.cpu_count() or 1, 4)
 
 _LOCK = threading.Lock()
 _POOLS: list[ProcessPoolExecutor] = []
+
+
+def share(servers: int) -> None:
+    """Have each of several servers of one machine open its share of processes."""
+    global MOST
+    MOST = max(1, MOST // servers)
 
 
 def processes() -> ProcessPoolExecutor:
@@ -51,14 +57,14 @@ def processes() -> ProcessPoolExecutor:
             os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
             fresh = multiprocessing.get_context("spawn")
             _POOLS.append(
-                ProcessPoolExecutor(PROCESSES, mp_context=fresh, initializer=_quiet)
+                ProcessPoolExecutor(MOST, mp_context=fresh, initializer=_quiet)
             )
         return _POOLS[0]
 
 
 def get_ready() -> None:
     """Have the processes begin and load what work needs, before one asks for it."""
-    WAITING.submit(lambda: [processes().submit(_load) for _ in range(PROCESSES)])
+    WAITING.submit(lambda: [processes().submit(_load) for _ in range(MOST)])
 
 
 def _load() -> None:
@@ -73,6 +79,12 @@ def _quiet() -> None:
     logging.getLogger("nmss_lab").setLevel(logging.ERROR)
 
 
+ENDED = (
+    "a process that computed was ended from outside, twice; perhaps this machine has "
+    "too little memory"
+)
+
+
 class Withdrawn(Exception):  # noqa: N818  nothing went wrong
     """The work was called off."""
 
@@ -82,13 +94,15 @@ class Lent(Executor):
 
     A few tasks at a time, so that the work of one session does not keep the others
     waiting; and ``withdraw`` ends whatever waits for a result at once, with a
-    ``Withdrawn``, though a task that a process has begun goes on to its end.
+    ``Withdrawn``, though a task that a process has begun goes on to its end.  Where a
+    process is killed, what it owed is given to new ones, once.
     """
 
     def __init__(self, pool: Executor, at_once: int = 4) -> None:
         self._pool, self._free = pool, at_once
         self._waiting: deque[tuple[Future[Any], Callable[[], Any]]] = deque()
         self._open: set[Future[Any]] = set()
+        self._again: set[Future[Any]] = set()
         self._lock = threading.RLock()
 
     def submit(
@@ -125,14 +139,25 @@ class Lent(Executor):
                 except RuntimeError as error:  # the pool broke, or is closed
                     inner = Future()
                     inner.set_exception(error)
-                inner.add_done_callback(partial(self._done, outer))
+                inner.add_done_callback(partial(self._done, outer, task))
 
-    def _done(self, outer: Future[Any], inner: Future[Any]) -> None:
+    def _done(
+        self, outer: Future[Any], task: Callable[[], Any], inner: Future[Any]
+    ) -> None:
+        broken = not inner.cancelled() and isinstance(inner.exception(), BrokenExecutor)
         with self._lock:
             self._free += 1
+            if broken and outer in self._open and outer not in self._again:
+                self._again.add(outer)
+                self._pool = processes()
+                self._waiting.appendleft((outer, task))
+                self._go_on()
+                return
             wanted = outer in self._open and outer.set_running_or_notify_cancel()
             self._open.discard(outer)
-        if wanted and inner.cancelled():
+        if wanted and broken:  # nothing that this process should try itself
+            outer.set_exception(ValueError(ENDED))
+        elif wanted and inner.cancelled():
             outer.set_exception(CancelledError())
         elif wanted and (error := inner.exception()) is not None:
             outer.set_exception(error)

@@ -1,4 +1,4 @@
-"""The command ``nmss-lab``: serve pages, reproduce, simulate, identify, study, tune.
+"""The command ``nmss-lab``: serve pages, simulate, identify, study, tune, report, ...
 
 Numerical and page libraries are imported inside the commands that need them, so
 that ``--version`` and ``--help`` answer at once.
@@ -8,14 +8,19 @@ import argparse
 import importlib
 import json
 import os
-import signal
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 from nmss_lab import __version__
-from nmss_lab.cli_studies import add_study, add_tune, designs_of
+from nmss_lab.cli_serve import add_serve
+from nmss_lab.cli_studies import (
+    add_report,
+    add_study,
+    add_tune,
+    case_named,
+    designs_of,
+)
 from nmss_lab.cli_studies import line as _line
 
 __all__ = ["main"]
@@ -57,21 +62,14 @@ def _parser() -> argparse.ArgumentParser:
         "--version", action="version", version=f"%(prog)s {__version__}"
     )
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    _add_serve(commands)
+    add_serve(commands)
     _add_reproduce(commands)
     _add_simulate(commands)
     _add_identify(commands)
     add_study(commands)
     add_tune(commands)
+    add_report(commands)
     return parser
-
-
-def _add_serve(commands: Any) -> None:
-    serve = commands.add_parser("serve", help="serve the live pages")
-    serve.add_argument("--port", type=_port, default=5006, help="0 takes any free port")
-    serve.add_argument("--address", default="127.0.0.1", help="address to listen on")
-    serve.add_argument("--show", action="store_true", help="open the web browser")
-    serve.set_defaults(command=_serve)
 
 
 def _add_reproduce(commands: Any) -> None:
@@ -84,8 +82,14 @@ def _add_reproduce(commands: Any) -> None:
 
 
 def _add_simulate(commands: Any) -> None:
-    simulate = commands.add_parser("simulate", help="run a case in closed loop")
-    simulate.add_argument("case", nargs="?", help="its name; without it: list them")
+    simulate = commands.add_parser(
+        "simulate", help="run a case or a design file in closed loop"
+    )
+    simulate.add_argument(
+        "case",
+        nargs="?",
+        help="its name, or a design file (.json); without it: list the cases",
+    )
     simulate.add_argument("--structure", help="name of a structure")
     simulate.add_argument("--csv", metavar="FILE", help="write the run to FILE")
     simulate.set_defaults(command=_simulate)
@@ -156,13 +160,6 @@ def _noise_orders(text: str) -> tuple[int, ...]:
     if len(orders) > 2 or "-" in text:
         raise argparse.ArgumentTypeError(f"{text!r}: expected AR or AR,MA, such as 2,1")
     return orders
-
-
-def _port(text: str) -> int:
-    """Return a port number, or 0 for any that is free."""
-    if not text.isdigit() or int(text) > 65535:
-        raise argparse.ArgumentTypeError(f"{text!r}: expected a port from 0 to 65535")
-    return int(text)
 
 
 def _identify(arguments: argparse.Namespace) -> None:
@@ -247,13 +244,13 @@ def _reproduce(arguments: argparse.Namespace) -> None:
 
 def _simulate(arguments: argparse.Namespace) -> None:
     """List the cases, or run one and print its notes, measures and moves."""
-    cases = importlib.import_module("nmss_lab.cases")
     if arguments.case is None:
+        cases = importlib.import_module("nmss_lab.cases")
         for name in cases.CASES:
             case = cases.case(name)
             print(f"{name:<28}{case.title}\n{'':<28}{', '.join(case.designs)}")
         return
-    case = cases.case(arguments.case)
+    case = case_named(arguments.case)
     designs = designs_of(case, arguments.structure and [arguments.structure])
     if arguments.csv and len(designs) > 1:
         raise ValueError("--csv writes one run: name it with --structure")
@@ -264,7 +261,7 @@ def _simulate(arguments: argparse.Namespace) -> None:
     }
     _print_runs(case, runs)
     if arguments.csv:
-        _write_run(next(iter(runs.values())), arguments.csv)
+        next(iter(runs.values())).record().to_csv(arguments.csv)
 
 
 def _print_runs(case: Any, runs: Mapping[str, Any]) -> None:
@@ -278,68 +275,6 @@ def _print_runs(case: Any, runs: Mapping[str, Any]) -> None:
             print(_line(v if isinstance(v, str) else f"{v:.5g}" for v in row.values()))
     for name, run in runs.items():
         print(f"\n{name}", *run.sentences, sep="\n- ")
-
-
-def _write_run(run: Any, file: str) -> None:
-    records = importlib.import_module("nmss_lab.records")
-    model = run.controller.model
-    names = {"y": model.y_names, "u": model.u_names}
-    if model.n_v:
-        names["v"] = model.v_names
-    units = {"time": "s", **model.units}
-    v = run.v if model.n_v else run.v[:, :0]
-    records.Record(run.t, run.y, run.u, v, run.r, names, units).to_csv(file)
-
-
-def _serve(arguments: argparse.Namespace) -> None:
-    """Serve the pages until interrupted (Ctrl-C) or terminated."""
-    # Every script, style sheet and font comes from the installed packages.
-    os.environ["BOKEH_RESOURCES"] = "server"
-    from panel.io.server import get_server
-
-    pages = _pages()
-    try:
-        server = get_server(
-            pages,
-            port=arguments.port,
-            address=arguments.address,
-            websocket_origin=_origins(arguments.address),
-            show=arguments.show,
-            title="NMSS Lab",
-        )
-    except OSError as error:
-        where = f"port {arguments.port} of {arguments.address}"
-        raise OSError(f"cannot listen on {where}: {error.strerror}") from error
-    # get_server has already taken care of Ctrl-C in the same way.
-    signal.signal(
-        signal.SIGTERM,
-        lambda *_: server.io_loop.add_callback_from_signal(server.io_loop.stop),
-    )
-    server.start()
-    address = f"http://{arguments.address}:{server.port}/"
-    print(f"NMSS Lab is at {address} (Ctrl-C stops it)", flush=True)
-    server.io_loop.start()
-    server.stop()
-    print("NMSS Lab has stopped", flush=True)
-
-
-def _origins(address: str) -> str | None:
-    """Return the hosts whose pages may connect; None: the address listened on."""
-    return "*" if address in {"0.0.0.0", "::", ""} else None
-
-
-def _pages() -> Mapping[str, Callable[[], Any]]:
-    """Return the pages of ``apps.dashboard``: URL path to a builder per session.
-
-    A wheel carries the package ``apps`` in ``nmss_lab/_pages``; in a checkout it
-    lies beside ``nmss_lab``.
-    """
-    here = Path(__file__).resolve().parent
-    shipped = here / "_pages"
-    sys.path.insert(0, str(shipped if shipped.is_dir() else here.parent))
-    pages: Mapping[str, Callable[[], Any]]
-    pages = importlib.import_module("apps.dashboard").pages()
-    return pages
 
 
 if __name__ == "__main__":

@@ -174,12 +174,14 @@ def page(browser: Browser) -> Iterator[Page]:
 class Server:
     """A running ``nmss-lab serve`` on a free port; its address is `url`."""
 
-    def __init__(self, log: Path, *, command: tuple[str, ...] = (), **popen: object):
+    def __init__(
+        self, log: Path, *options: str, command: tuple[str, ...] = (), **popen: object
+    ):
         self.log = log
         launch = command or (sys.executable, "-m", "nmss_lab.cli")
         with log.open("w") as errors:
             self.process = subprocess.Popen(
-                [*launch, "serve", "--port", "0"],
+                [*launch, "serve", "--port", "0", *options],
                 stdout=subprocess.PIPE,
                 stderr=errors,
                 text=True,
@@ -198,7 +200,7 @@ class Server:
 
     def _address(self) -> str:
         first = self.process.stdout.readline()
-        found = re.search(r"http://127\.0\.0\.1:\d+/", first)
+        found = re.search(r"http://127\.0\.0\.1:\d+/\S*", first)
         if not found:
             self.process.kill()
             self.process.communicate()
