@@ -43,11 +43,60 @@ export function render({ model, el }) {
       if (latency.length > 500) latency.shift()
     }
     waiting = ++sent
-    model.sent = { ...values, message: waiting }
+    const { A, B, ...own } = values  // what is held is the bar's to change
+    model.sent = { ...own, message: waiting }
     delete values.reset
+    delete values.whole
   }
 
+  // What was chosen before: whole sets of values, the latest last. A hand that moves one
+  // control changes them once. They outlast the page as long as its tab.
+  const kept = `nmss-history-${location.pathname}`
+  let past = [], future = []
+  try { [past, future] = JSON.parse(sessionStorage.getItem(kept)) ?? [[], []] } catch { /* none */ }
+  let last = { name: "", at: 0 }
+  const tellHistory = () => {
+    const detail = { undo: past.length, redo: future.length }
+    window.dispatchEvent(new CustomEvent("nmss-history", { detail }))
+    try { sessionStorage.setItem(kept, JSON.stringify([past, future])) } catch { /* full */ }
+  }
+  const remember = (name) => {
+    const now = performance.now()
+    const on = last.name === name && now - last.at < 1000
+    last = { name, at: now }
+    if (on) return
+    past = [...past.slice(-49), { ...values }]
+    future = []
+    tellHistory()
+  }
+  const recall = (from, to) => {
+    const before = from.pop()
+    if (!before) return
+    to.push({ ...values })
+    last = { name: "", at: 0 }
+    values = { ...before, A: values.A, B: values.B, whole: true }  // what is held stays
+    for (const [name, show] of Object.entries(update)) show(values[name])
+    needed()
+    send()
+    tellHistory()
+  }
+  const undo = () => recall(past, future)
+  const redo = () => recall(future, past)
+  const keys = (event) => {
+    if (!(event.ctrlKey || event.metaKey) || event.altKey) return
+    const key = event.key.toLowerCase()
+    // a text that is being typed has an undo of its own
+    if (/^(text|number)$/.test(event.composedPath()[0].type ?? "")) return
+    if (key === "z" && !event.shiftKey) undo()
+    else if (key === "y" || key === "z") redo()
+    else return
+    event.preventDefault()
+  }
+  const listened = [["keydown", keys], ["nmss-undo", undo], ["nmss-redo", redo], ["nmss-bar", tellHistory]]
+  for (const [name, heard] of listened) window.addEventListener(name, heard)
+
   const choose = (name, value) => {
+    remember(name)
     values[name] = value
     touched[name] = value
     if (update[name]) update[name](value)
@@ -65,6 +114,18 @@ export function render({ model, el }) {
     }
     const text = query.toString()
     history.replaceState(null, "", location.pathname + (text ? "?" + text : ""))
+    tellAddress(text)
+  }
+
+  // What other pages need to know: also a case that this page opens by itself, unless
+  // it is there in place of one which it cannot show
+  const came = new URLSearchParams(location.search)
+  const tellAddress = (text) => {
+    const query = new URLSearchParams(text)
+    if (values.case) query.set("case", values.case)
+    const aside = came.has("via") && came.has("case") && values.case === instead
+    const detail = { query: query.toString(), aside }
+    window.dispatchEvent(new CustomEvent("nmss-address", { detail }))
   }
 
   const slider = (item, id) => {
@@ -217,14 +278,27 @@ export function render({ model, el }) {
   const needed = () => {
     for (const { name, when } of model.form.groups.flatMap((group) => group.items)) {
       const idle = when && ![when[1]].flat().includes(values[when[0]])
-      form.querySelector(`[data-name="${name}"]`).classList.toggle("idle", Boolean(idle))
+      // a form that is described anew is not built yet
+      form.querySelector(`[data-name="${name}"]`)?.classList.toggle("idle", Boolean(idle))
     }
   }
 
-  // A player may ask to look into a sample
-  const look = (event) => { if (update.inside) choose("inside", event.detail) }
-  window.addEventListener("nmss-look", look)
-  model.on("remove", () => window.removeEventListener("nmss-look", look))
+  // Other parts of a page choose, too: a sample to look into, rows of a sheet
+  const elsewhere = ({ detail: { name, value } }) => { if (name in values) choose(name, value) }
+  window.addEventListener("nmss-choose", elsewhere)
+  // ... and lead to a group of choices
+  const group = ({ detail: { title } }) => {
+    const part = form.querySelector(`details[data-title="${title}"]`)
+    part.open = true
+    part.scrollIntoView({ block: "start" })
+    part.querySelector("input, select")?.focus({ preventScroll: true })
+  }
+  window.addEventListener("nmss-group", group)
+  model.on("remove", () => {
+    window.removeEventListener("nmss-choose", elsewhere)
+    window.removeEventListener("nmss-group", group)
+    for (const [name, heard] of listened) window.removeEventListener(name, heard)
+  })
 
   // Values that belong to a form which is still on its way wait for it
   let stale = false, held = false
@@ -260,4 +334,8 @@ export function render({ model, el }) {
   }
 
   build()
+  tellHistory()
+  const instead = values.case !== came.get("case") ? values.case : null
+  if (came.has("via")) writeAddress()
+  else tellAddress(location.search)
 }

@@ -58,16 +58,38 @@ const recolour = (plot, colors) => {
   }
 }
 
+const keepFile = (blob, name) => {
+  const link = element("a", { download: name })
+  link.href = URL.createObjectURL(blob)
+  link.click()
+  setTimeout(() => URL.revokeObjectURL(link.href), 1000)
+}
+
+// Circles are round: the longer side of the figure of poles shows more of the plane.
+const keepRound = (model) => {
+  const round = () => {
+    const view = figureViews().poles
+    const { width, height } = view.frame.bbox
+    if (!(width > 0 && height > 0)) return
+    const { x_range: x, y_range: y } = view.model
+    const [wide, tall] = [Math.max(1, width / height), Math.max(1, height / width)]
+    quietly(x, { start: -x.reset_end * wide, end: x.reset_end * wide })
+    quietly(y, { start: -x.reset_end * tall, end: x.reset_end * tall })
+  }
+  const soon = () => setTimeout(round, 50)
+  window.addEventListener("resize", soon)
+  model.on("remove", () => window.removeEventListener("resize", soon))
+  figureViews().poles.model.x_range.properties.reset_end.change.connect(soon)
+  soon()
+}
+
 // What the server hands over: ``saved`` is a file to keep, ``leads`` an address to open.
 const handOver = (model) => {
-  model.on("saved", () => {
-    const { name, text } = model.saved
-    const link = element("a", { download: name })
-    link.href = URL.createObjectURL(new Blob([text], { type: "application/json" }))
-    link.click()
-    setTimeout(() => URL.revokeObjectURL(link.href), 1000)
+  if (model.saved) model.on("saved", () => {
+    const { name, text, type = "application/json" } = model.saved
+    keepFile(new Blob([text], { type }), name)
   })
-  model.on("leads", () => location.assign(model.leads.to))
+  if (model.leads) model.on("leads", () => location.assign(model.leads.to))
 }
 
 // Figures in the colours of the page, now and whenever they change; ``ready`` is called

@@ -46,14 +46,12 @@ export function render({ model, el }) {
   const fresh = button("Suggest", "suggest", { title: "Goals that suit the design to begin with" })
 
   // What is done with the design
-  const undo = button("Undo", "undo", { title: "Back to the design before the last tuning" })
+  const undo = button("Undo tuning", "undo", { title: "Back to the design before the last tuning" })
   const on = button("Continue from here", "continue", { title: "The next tuning starts from the present design" })
-  const keeps = ["A", "B"].map((which) => button(`Keep as ${which}`, () => ({ act: "keep", which })))
   const loop = button("Receding horizon \u2192", "loop", { title: "Open the design on the page Receding horizon" })
   const robust = button("Robustness \u2192", "robust", { title: "Open the design on the page Robustness" })
-  const save = button("Save", "save", { title: "Keep the present design as a file design.json" })
   const gap = element("span", { class: "gap" })
-  const done = element("div", { class: "search under" }, add, fresh, gap, undo, on, ...keeps, loop, robust, save)
+  const done = element("div", { class: "search under" }, add, fresh, gap, undo, on, loop, robust)
 
   // Matching a gain
   const gain = element("input", { type: "text", id: "gain", name: "gain", spellcheck: "false", autocomplete: "off", maxlength: "4000", "aria-describedby": "gain-help" })
@@ -213,10 +211,6 @@ export function render({ model, el }) {
     undo.disabled = !now.undo || now.running
     on.disabled = !now.tuned || now.running
     for (const button of [loop, robust]) button.disabled = !now.tuned
-    for (const [i, which] of ["A", "B"].entries()) {
-      keeps[i].textContent = now.kept[which] ? `Keep as ${which} \u2713` : `Keep as ${which}`
-      keeps[i].title = now.kept[which] ? `${which} is: ${now.kept[which]}` : `Keep the present design as ${which}, to compare`
-    }
     own.hidden = !now.gain
     help.textContent = now.shape
     found.textContent = now.match

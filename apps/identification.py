@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 import numpy as np
 import param
 
-from apps.session import Form, known_case
+from apps.session import HELD, Holding, known_case
 from nmss_lab.identify import (
     Candidate,
     Noise,
@@ -206,7 +206,7 @@ def _is_clock(name: str) -> bool:
     return word in ("t", "time", "date", "datetime", "timestamp", "second", "")
 
 
-class IdentifyChoices(Form):
+class IdentifyChoices(Holding):
     """Which record, which spans of it, and which models to try."""
 
     record = param.Selector(
@@ -416,13 +416,17 @@ class IdentifyChoices(Form):
         self.file: Upload | None = None
         self.take_record("gas_furnace")
 
+    def misfit(self, text: str) -> str:
+        """Held designs are not shown among models."""
+        return "this page shows models"
+
     def take_record(self, name: str) -> None:
         """Choose a record and put every other choice where the record has it."""
         if name not in RECORDS:
             raise ValueError(f"record = {name!r}: expected one of {tuple(RECORDS)}")
         if name == "file" and self.file is None:
             raise ValueError("no file has been uploaded on this page yet")
-        kept = {"record", "output", *self.spans, *self.of_file}
+        kept = {"record", "output", *HELD, *self.spans, *self.of_file}
         for key in (key for key in self.names() if key not in kept):
             setattr(self, key, PRESETS[name].get(key, self.param[key].default))
         self.record = name

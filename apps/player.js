@@ -87,8 +87,8 @@ export function render({ model, el }) {
     const look = element("button", { type: "button", class: "look" }, "Look into this sample")
     look.addEventListener("click", () => {
       play(false)
-      const detail = Math.floor(time + 1e-9)
-      window.dispatchEvent(new CustomEvent("nmss-look", { detail }))
+      const detail = { name: "inside", value: Math.floor(time + 1e-9) }
+      window.dispatchEvent(new CustomEvent("nmss-choose", { detail }))
     })
     looking.push(look)
   }
@@ -264,7 +264,11 @@ export function render({ model, el }) {
       const view = views[chart.name]
       if (view?.frame?.bbox?.width > 0) paint(chart, view, k, colors)
     }
-    if (k !== described) { describe(k); described = k }
+    if (k !== described) {
+      describe(k)
+      described = k
+      if (place.keys) window.dispatchEvent(new CustomEvent("nmss-sample", { detail: k }))
+    }
     statistics.frames += 1
     statistics.sample = k
     statistics.playing = playing

@@ -22,6 +22,15 @@ def script(name: str) -> str:
     return "\n".join(part.read_text(encoding="utf-8") for part in parts)
 
 
+def hand_over(component: Any, name: str, /, **what: Any) -> None:
+    """Have the browser keep a file ("saved"), open an address ("leads") or the like.
+
+    The number tells the same thing asked for twice from the same thing told twice.
+    """
+    number = getattr(component, name).get("number", 0) + 1
+    setattr(component, name, {**what, "number": number})
+
+
 class Controls(JSComponent):
     """A form made from a description of choices.
 

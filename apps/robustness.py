@@ -364,11 +364,12 @@ class RobustnessChoices(LoopChoices):
         return [
             *self._head([names, *self._study_imports()]),
             "",
+            *self._held_lines(),
             *self._case_lines(),
             *self._scenario_lines(),
             *self._uncertainty_lines(),
             "",
-            *self._lines_for_designs("designs", "design"),
+            *self._designs_lines(),
             "",
             f"study = monte_carlo({', '.join(arguments)})",
         ]
@@ -488,10 +489,11 @@ class RobustnessChoices(LoopChoices):
             continuous=None,
         )
         lines = [
+            *self._held_lines(),
             *self._case_lines(),
             *self._scenario_lines(),
             *self._uncertainty_lines(),
-            *self._lines_for_designs("designs", "design"),
+            *self._designs_lines(),
             f"plant = realisation(uncertainty, {number}, seed={study.seed}).plant",
             'plant = plant.plant() if hasattr(plant, "plant") else plant',
             *_shortening_lines(samples),
@@ -502,7 +504,7 @@ class RobustnessChoices(LoopChoices):
         ]
         imports = (
             *self._study_imports(),
-            *self._case_imports(),
+            *self._cases_imports(),
             "from nmss_lab.uncertainty import realisation",
         )
         origin = Origin(imports, tuple(lines))

@@ -7,29 +7,45 @@ made from the same lines: what the page shows is what its script prints.
 from __future__ import annotations
 
 import functools
-import hashlib
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
-from typing import Any, ClassVar, NamedTuple
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+from urllib.parse import parse_qsl, urlencode
 
 import numpy as np
 import param
 
-from nmss_lab.cases import LINEAR_CASES, Case, case, model_case, piecewise
+from apps.kept import GONE, KEPT, Origin, keep_case
+from nmss_lab.cases import (
+    LINEAR_CASES,
+    Case,
+    case,
+    design_case,
+    governed,
+    model_case,
+    piecewise,
+)
 from nmss_lab.controller import Limits
-from nmss_lab.design import Design
-from nmss_lab.files import dumps
+from nmss_lab.design import VARYING, Design
+from nmss_lab.files import Study, dumps, loads
 from nmss_lab.identify import Estimate
-from nmss_lab.models import LinearPlant
+from nmss_lab.models import DifferenceModel, LinearPlant
 from nmss_lab.mpc import STRUCTURES
 from nmss_lab.predict import Horizon
 from nmss_lab.simulate import Run, Scenario, closed_loop
+from nmss_lab.state_dependent import StateDependentModel
 
 DIVERGED = 1e9
 """Outputs beyond this are not drawn: the loop is unstable."""
 
 MOST_RUNS = 3
+
+HELD = "A", "B"
+"""Choices that hold a design from page to page: each the address that makes it."""
+
+MAKERS: dict[str, type[DesignChoices]] = {}
+"""Choices that such an address may belong to, by page."""
 
 OPENS_WITH = {
     "ifac93_6_3_3": ("wang_young", "forward_path"),
@@ -49,43 +65,6 @@ def known_case(name: str) -> Case:
     return KEPT[name] if name in KEPT else _worked_case(name)
 
 
-KEPT: dict[str, Case] = {}
-"""Cases that pages made and sent to others, by name, the latest last."""
-
-ORIGINS: dict[str, Origin] = {}
-"""Python that makes each of them."""
-
-MOST_KEPT = 200
-
-GONE = {
-    "model": "its model is no longer kept",
-    "tuned": "its tuned design is no longer kept",
-    "drawn": "its plant is no longer kept",
-}
-"""What a kept case is about, by the beginning of its name."""
-
-
-class Origin(NamedTuple):
-    """Python of a kept case: what it imports, and lines that make ``example``."""
-
-    imports: tuple[str, ...]
-    lines: tuple[str, ...]
-
-
-def keep_case(kind: str, content: str, example: Case, origin: Origin) -> str:
-    """Keep a case for the other pages; return its name, the same for equal content.
-
-    ``kind`` is a key of ``GONE``.
-    """
-    name = f"{kind}-{hashlib.sha256(content.encode()).hexdigest()[:12]}"
-    KEPT.setdefault(name, replace(example, name=name))
-    ORIGINS[name] = origin
-    while len(KEPT) > MOST_KEPT:
-        oldest = next(iter(KEPT))
-        del KEPT[oldest], ORIGINS[oldest]
-    return name
-
-
 def keep_model(estimate: Estimate) -> str:
     """Keep an identified model for the other pages; return the name of its case."""
     example = model_case(estimate.to_model(), estimate.covariance, "model")
@@ -101,6 +80,46 @@ def keep_model(estimate: Estimate) -> str:
         ),
     )
     return keep_case("model", dumps(estimate), example, origin)
+
+
+def open_design(text: str) -> str:
+    """Keep what a design file holds; return the address of the page that shows it.
+
+    Raises
+    ------
+    ValueError
+        If the text is no such file, or holds something else than a design or a model.
+    """
+    content = loads(text)
+    if isinstance(content, Estimate):
+        return f"receding_horizon?case={keep_model(content)}"
+    if isinstance(content, Design):
+        content = Study(content)
+    if not isinstance(content, Study):
+        raise ValueError(
+            f"the file holds a {type(content).__name__.lower()}, expected a design or "
+            "a model; records are opened on the page Identify"
+        )
+    design = content.design
+    example = design_case(design, content.plant, content.scenario)
+    origin = Origin(
+        (
+            "from nmss_lab.cases import design_case",
+            "from nmss_lab.files import Study, load",
+        ),
+        (
+            "# design.json: the file that was opened",
+            'study = load("design.json")',
+            "study = study if isinstance(study, Study) else Study(study)",
+            "example = design_case(study.design, study.plant, study.scenario)",
+        ),
+    )
+    name = keep_case("opened", dumps(content), example, origin)
+    if design.structure in VARYING:
+        return f"state_dependent?case={name}"
+    if design.structure in PAIR:
+        return f"governor?case={name}"
+    return f"receding_horizon?case={name}"
 
 
 def plain(name: str) -> str:
@@ -119,6 +138,8 @@ def plain(name: str) -> str:
         "sdp_governor": "PIP with governor",
         "tuned": "Tuned",
         "before": "Before tuning",
+        "A": "A",
+        "B": "B",
     }
     scheme = name.removeprefix("integral_")
     if scheme in ("frozen", "iterated", "gauss_newton", "newton") and scheme != name:
@@ -155,7 +176,8 @@ class Form(param.Parameterized):
             are taken.
         """
         wrong = ""
-        for key in (key for key in values if key in self.names()):
+        # what is held first: it is among what the others choose from
+        for key in sorted(set(values) & set(self.names()), key=self.names().index):
             try:
                 setattr(self, key, self._read(key, values[key]))
             except (ValueError, TypeError) as error:
@@ -206,11 +228,50 @@ class Form(param.Parameterized):
         return plain(name)
 
 
-class Choices(Form):
-    """What both pages share: case, limits, plant against model, disturbances."""
+class Holding(Form):
+    """Choices that come with two held designs."""
+
+    A = param.String("", label="Design A", doc="The address of a design that is held.")
+    B = param.String("", label="Design B", doc="Another one.")
+
+    @classmethod
+    def names(cls) -> list[str]:
+        """Names of all choices, held designs first."""
+        return [*HELD, *super().names()]
+
+    def _read(self, key: str, value: Any) -> Any:
+        if key not in HELD:
+            return super()._read(key, value)
+        text = str(value)
+        if text:
+            held(text)
+        return text
+
+    def misfit(self, text: str) -> str:
+        """Say why a held design cannot be shown here; nothing if it can."""
+        raise NotImplementedError
+
+    def fitting(self) -> dict[str, Design]:
+        """Held designs that can be shown here, A before B."""
+        texts = {key: getattr(self, key) for key in HELD}
+        return {
+            key: held(text).design
+            for key, text in texts.items()
+            if text and not self.misfit(text)
+        }
+
+
+class Choices(Holding):
+    """What the pages share: case, limits, plant against model, disturbances."""
 
     case = param.Selector(
         label="Case", doc="A worked example: plant, model, weights and scenario."
+    )
+    structures = param.ListSelector(
+        default=[],
+        label="Structures",
+        doc="Up to three controllers of this case, side by side; A and B are designs "
+        "that are held.",
     )
     output = param.Integer(
         0, bounds=(0, 11), label="Output shown", doc="Which output y the plots show."
@@ -301,8 +362,19 @@ class Choices(Form):
     }
     groups: ClassVar[dict[str, tuple[str, ...]]] = {}
     default_case: ClassVar[str] = ""
+    makes: ClassVar[str] = ""
+    """Page whose address makes the designs of these choices."""
+    of_design: ClassVar[tuple[str, ...]] = ()
+    """What that address states, besides case and structure."""
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        """List the choices that make designs."""
+        super().__init_subclass__(**options)
+        if "makes" in vars(cls):
+            MAKERS[cls.makes] = cls
 
     def __init__(self, **values: Any) -> None:
+        self._offered: list[str] = []
         super().__init__()
         self.param["case"].objects = self.cases()
         self.take_case(self.default_case)
@@ -325,7 +397,7 @@ class Choices(Form):
         """Choose a case and put every other choice where the case has it."""
         example = self._case_of(name)
         for key, parameter in self.param.objects("existing").items():
-            if key not in ("name", "case"):
+            if key not in ("name", "case", *HELD):
                 setattr(self, key, parameter.default)
         self.case = name
         for key, size in (("output", example.model.n_y), ("input", example.model.n_u)):
@@ -381,9 +453,59 @@ class Choices(Form):
 
     def defaults(self) -> dict[str, Any]:
         """All choices as they are when the case is chosen."""
+        return {**self._fresh().values(), "case": self.default_case}
+
+    def _fresh(self) -> Choices:
+        """All choices as they are when the case is chosen."""
         fresh = type(self)()
+        fresh._welcome(self.case)
         fresh.take_case(self.case)
-        return {**fresh.values(), "case": self.default_case}
+        return fresh
+
+    # Held designs
+
+    def _read(self, key: str, value: Any) -> Any:
+        value = super()._read(key, value)
+        if key in HELD:
+            self._offer(self._offered, {key: value})
+        return value
+
+    def _offer(self, names: Iterable[str], given: Mapping[str, str] = {}) -> None:
+        """Offer structures of the case, and what is held, where it fits."""
+        self._offered = list(names)
+        texts = {key: given.get(key, getattr(self, key)) for key in HELD}
+        fitting = [k for k, text in texts.items() if text and not self.misfit(text)]
+        offered = [*self._offered, *fitting]
+        self.structures = [name for name in self.structures if name in offered]
+        self.param["structures"].objects = offered
+
+    def misfit(self, text: str) -> str:
+        """Say why a held design cannot control this plant; nothing if it can."""
+        model, wanted = self.example.model, held(text).design.model
+        for size, word in (
+            ("n_y", "outputs"),
+            ("n_u", "inputs"),
+            ("n_v", "measured disturbances"),
+        ):
+            theirs, ours = getattr(_sizes(wanted), size), getattr(model, size)
+            if theirs != ours:
+                return f"it is for {theirs} {word}, this plant has {ours}"
+        if not math.isclose(_sizes(wanted).dt, model.dt):
+            return f"it acts every {_sizes(wanted).dt:g} s, not every {model.dt:g} s"
+        return ""
+
+    def hold(self, name: str) -> str:
+        """Return the address that makes the design of that name, on any page."""
+        if name in HELD:
+            return str(getattr(self, name))
+        maker = MAKERS[self.makes]
+        usual = maker(case=self.case)
+        stated = {
+            key: getattr(self, key)
+            for key in maker.of_design
+            if getattr(self, key) != getattr(usual, key)
+        }
+        return held_as(self.makes, self.case, name, stated)
 
     def _shown(self, key: str) -> bool:
         model = self.example.model
@@ -404,7 +526,12 @@ class Choices(Form):
 
     def _word(self, key: str, name: str) -> str:
         if key == "case":
-            return _case_title(known_case(name))
+            return case_title(known_case(name))
+        if key == "structures" and name in HELD:
+            found = held(getattr(self, name))
+            known = found.choices.case == self.case
+            other = "" if known else f", of {found.choices.example.title}"
+            return f"{name}: {found.words}{other}"
         if key == "structures":
             return plain(name)
         return {"case": "as in the case", "off": "none"}.get(name, name)
@@ -471,8 +598,45 @@ class Choices(Form):
     def _first(self) -> int:
         return min(round(self.step_at / 100.0 * self._samples), self._samples - 1)
 
+    def usual_structures(self) -> list[str]:
+        """Structures with which the case opens."""
+        return list(self._fresh().structures)
+
+    def study_of(self, name: str) -> Study:
+        """Return one of the designs with plant and scenario, as data."""
+        return Study(self.designs()[name], self._as_data(), self.scenario())
+
+    def _as_data(self) -> Any:
+        """Plant as files hold it."""
+        return self.plant()
+
     def designs(self) -> dict[str, Design]:
-        """Designs to run, by name."""
+        """Chosen structures with the choices, and what is held as it is."""
+        if not 1 <= len(self.structures) <= MOST_RUNS:
+            raise ValueError(
+                f"structures: {len(self.structures)} chosen, expected 1 to {MOST_RUNS}"
+            )
+        known = self.example.designs
+        for name in self.structures:
+            if name not in (*known, *HELD):
+                raise ValueError(
+                    f"structures: this case has no {name!r}; it has "
+                    f"{', '.join(self._offered)}"
+                )
+        return {
+            name: self._held(name) if name in HELD else self._changed(known[name])
+            for name in self.structures
+        }
+
+    def _held(self, name: str) -> Design:
+        text = getattr(self, name)
+        wrong = self.misfit(text) if text else "no design is held as such"
+        if wrong:
+            raise ValueError(f"structures: {name} cannot be shown here, {wrong}")
+        return held(text).design
+
+    def _changed(self, design: Design) -> Design:
+        """Put the choices into a design of the case."""
         raise NotImplementedError
 
     def runs(self) -> dict[str, Run]:
@@ -510,31 +674,58 @@ class Choices(Form):
         lines = [
             *self._head(_SCRIPT_IMPORTS),
             "",
+            *self._held_lines(),
             *self._case_lines(),
             *self._plant_lines(),
             *self._scenario_lines(),
             "",
-            *self._design_lines(),
-            "",
+            *self._designs_lines(),
+            "runs = {",
+            "    name: closed_loop(plant, design.build(), scenario)",
+            "    for name, design in designs.items()",
+            "}",
             f"for row in table(runs, channel={self.output}):",
             "    print(row)",
         ]
         return "\n".join(lines) + "\n"
 
     def _head(self, imports: Iterable[str]) -> list[str]:
-        """First lines of a script: what it imports, and what its case needs."""
-        return head([*imports, *self._case_imports()])
+        """First lines of a script: what it imports, and what its cases need."""
+        return head([*imports, *self._cases_imports()])
+
+    def _cases_imports(self) -> list[str]:
+        """Say what the lines of the case, and of what is held, import."""
+        others = [held(getattr(self, key)).choices for key in self._held_chosen]
+        return [line for one in (self, *others) for line in one._case_imports()]
+
+    @property
+    def _held_chosen(self) -> list[str]:
+        return [key for key in self.structures if key in HELD]
+
+    def _held_lines(self) -> list[str]:
+        """Lines that make what is held and shown."""
+        lines = ["held = {}"] if self._held_chosen else []
+        for key in self._held_chosen:
+            found = held(getattr(self, key))
+            lines += [
+                f"# {key}: {found.words}",
+                *found.choices._case_lines(),
+                *found.choices._designs_lines(),
+                f'held["{key}"] = designs["{found.name}"]',
+                "",
+            ]
+        return lines
 
     def _case_imports(self) -> tuple[str, ...]:
         """Say what ``_case_lines`` import."""
         if self.case not in KEPT:
             return ("from nmss_lab.cases import case",)
-        return ORIGINS[self.case].imports
+        return KEPT.origins[self.case].imports
 
     def _case_lines(self) -> list[str]:
         if self.case not in KEPT:
             return [f'example = case("{self.case}")']
-        return list(ORIGINS[self.case].lines)
+        return list(KEPT.origins[self.case].lines)
 
     def _plant_lines(self) -> list[str]:
         lines = ["plant = example.plant"]
@@ -583,18 +774,95 @@ class Choices(Form):
         own = ", ".join(f"{key}={text}" for key, _, text in self._own_limits())
         return [f"    limits = replace(limits, {own})"] if own else []
 
-    def _design_lines(self) -> list[str]:
+    def _designs_lines(self) -> list[str]:
+        """Lines that make ``designs``, those that are held among them."""
+        own = [name for name in self.structures if name not in HELD]
+        lines = [
+            *self._before_designs(),
+            "designs = {}",
+            f"for name in {own!r}:",
+            "    design = example.designs[name]",
+            "    limits = design.limits",
+            *self._limit_lines(),
+            *self._changed_lines(),
+        ]
+        if not self._held_chosen:
+            return lines
+        order = f"{self.structures!r}"
+        return [*lines, f"designs = {{k: (designs | held)[k] for k in {order}}}"]
+
+    def _before_designs(self) -> list[str]:
+        return []
+
+    def _changed_lines(self) -> list[str]:
+        """Lines inside the loop that put the choices into ``design``."""
         raise NotImplementedError
 
 
-class DesignChoices(Choices):
-    """What pages share whose controllers predict: which, how far, and at what price."""
+def _sizes(model: DifferenceModel | StateDependentModel) -> DifferenceModel:
+    return model.wide if isinstance(model, StateDependentModel) else model
 
-    structures = param.ListSelector(
-        default=[],
-        label="Structures",
-        doc="Up to three controllers of this case, side by side.",
-    )
+
+@dataclass(frozen=True)
+class Held:
+    """A design that was held: its choices, its name there, itself, its differences."""
+
+    choices: Choices
+    name: str
+    design: Design
+    words: str
+
+
+def held_as(page: str, case: str, name: str, stated: Mapping[str, Any] = {}) -> str:
+    """Return the address of a design; of one "as it is" on the page "case"."""
+    return f"{page}?{urlencode({'case': case, 'structures': name, **stated})}"
+
+
+@functools.lru_cache(maxsize=256)
+def held(text: str) -> Held:
+    """Make a design of the address that holds it.
+
+    Raises
+    ------
+    ValueError
+        If it is none, or belongs to a case that is no longer kept.
+    """
+    page, _, query = text.partition("?")
+    stated = dict(parse_qsl(query))
+    if page not in MAKERS or not {"case", "structures"} <= set(stated):
+        raise ValueError(f"{text[:80]!r} is no design that is held")
+    choices = MAKERS[page](**stated)
+    if len(choices.structures) != 1 or choices.structures[0] in HELD:
+        raise ValueError(f"{text[:80]!r} does not name one structure")
+    ((name, design),) = choices.designs().items()
+    del stated["case"], stated["structures"]
+    words = [plain(name), *(f"{key} {value}" for key, value in stated.items())]
+    return Held(choices, name, design, ", ".join(words))
+
+
+class AsItIs(Choices):
+    """A design just as it is in its case."""
+
+    groups: ClassVar[dict[str, tuple[str, ...]]] = {"Case": ("case", "structures")}
+    default_case: ClassVar[str] = "ifac93_6_3_3"
+    makes: ClassVar[str] = "case"
+
+    def take_case(self, name: str) -> None:
+        """Choose a case, of whatever kind, and its first design."""
+        super().take_case(name)
+        self._offer(self.example.designs)
+        self.structures = [next(iter(self.example.designs))]
+
+    def _changed(self, design: Design) -> Design:
+        return design
+
+    def _changed_lines(self) -> list[str]:
+        return ["    designs[name] = design"]
+
+
+class DesignChoices(Choices):
+    """What pages share whose controllers predict: how far, and at what price."""
+
     Nc = param.Integer(
         5,
         bounds=(1, 30),
@@ -620,24 +888,6 @@ class DesignChoices(Choices):
         "weight_move": "log",
     }
 
-    def designs(self) -> dict[str, Design]:
-        """Chosen structures with the chosen horizons, weights and limits."""
-        if not 1 <= len(self.structures) <= MOST_RUNS:
-            raise ValueError(
-                f"structures: {len(self.structures)} chosen, expected 1 to {MOST_RUNS}"
-            )
-        known, offered = self.example.designs, self.param["structures"].objects
-        for name in self.structures:
-            if name not in known:
-                raise ValueError(
-                    f"structures: this case has no {name!r}; it has "
-                    f"{', '.join(offered)}"
-                )
-        return {name: self._changed(known[name]) for name in self.structures}
-
-    def _changed(self, design: Design) -> Design:
-        raise NotImplementedError
-
 
 class LoopChoices(DesignChoices):
     """Choices of the page on the receding horizon."""
@@ -657,14 +907,16 @@ class LoopChoices(DesignChoices):
         "Plant and disturbances": ("gain", "dynamics", "step_u", "step_y", "step_at"),
     }
     default_case: ClassVar[str] = "ifac93_6_3_3"
+    makes: ClassVar[str] = "receding_horizon"
+    of_design: ClassVar[tuple[str, ...]] = (*groups["Design"], *groups["Limits"])
 
     def take_case(self, name: str) -> None:
         """Choose a case: its predictive designs, and the horizons of the first."""
         designs = known_case(name).designs
         predictive = [key for key, d in designs.items() if d.structure in STRUCTURES]
-        self.structures, self.param["structures"].objects = [], predictive
         self._predictive = predictive
         super().take_case(name)
+        self._offer(predictive)
         self.structures = list(OPENS_WITH.get(name) or _first_choice(predictive))
         horizon = self._main_design.horizon
         self.Np, self.Nc = horizon.Np, horizon.Nc
@@ -694,7 +946,8 @@ class LoopChoices(DesignChoices):
     def _horizon_lines(self) -> tuple[list[str], str]:
         """Lines before the loop of a script, and the horizon inside it."""
         chosen = f"Horizon({self.Np}, {self.Nc})"
-        designs = {name: self.example.designs[name] for name in self.structures}
+        names = [name for name in self.structures if name not in HELD]
+        designs = {name: self.example.designs[name] for name in names}
         own = ", ".join(
             f'"{name}": Horizon({design.horizon.Np}, {design.horizon.Nc})'
             for name, design in designs.items()
@@ -704,33 +957,32 @@ class LoopChoices(DesignChoices):
             return [], chosen
         return [f"own = {{{own}}}"], f"own.get(name, {chosen})"
 
-    def _design_lines(self) -> list[str]:
-        loop = "closed_loop(plant, design.build(), scenario)"
-        return self._lines_for_designs("runs", loop)
+    def _before_designs(self) -> list[str]:
+        return self._horizon_lines()[0]
 
-    def _lines_for_designs(self, collected: str, value: str) -> list[str]:
-        """Lines that make each ``design`` and collect a value of it by its name."""
-        before, horizon = self._horizon_lines()
+    def _changed_lines(self) -> list[str]:
         reading = (
             [] if self.reading == "case" else [f'        reference="{self.reading}",']
         )
         return [
-            *before,
-            f"{collected} = {{}}",
-            f"for name in {list(self.structures)!r}:",
-            "    design = example.designs[name]",
-            "    limits = design.limits",
-            *self._limit_lines(),
-            "    design = replace(",
+            "    designs[name] = replace(",
             "        design,",
-            f"        horizon={horizon},",
+            f"        horizon={self._horizon_lines()[1]},",
             f"        Q={self.weight_y!r} * np.asarray(design.Q),",
             f"        R={self.weight_move!r} * np.asarray(design.R),",
             "        limits=limits,",
             *reading,
             "    )",
-            f"    {collected}[name] = {value}",
         ]
+
+
+@functools.lru_cache(maxsize=64)
+def _with_governor(example: Case) -> Case:
+    return governed(example)
+
+
+PAIR = "governor", "pip"
+"""A gain with a governor of its reference, and alone."""
 
 
 class GovernorChoices(Choices):
@@ -776,35 +1028,38 @@ class GovernorChoices(Choices):
         "decay": ("reading", "decaying"),
     }
     groups: ClassVar[dict[str, tuple[str, ...]]] = {
-        "Case": ("case", "reference", "output", "input"),
+        "Case": ("case", "structures", "reference", "output", "input"),
         "Governor": ("Np", "reading", "free_until", "decay", "timing"),
         "Limits": ("limit_u", "u_max", "limit_du", "du_max", "limit_y", "y_max"),
         "Plant and disturbances": ("gain", "dynamics", "step_u", "step_y", "step_at"),
     }
     default_case: ClassVar[str] = "governor_3_4"
-
-    @classmethod
-    @functools.cache
-    def cases(cls) -> list[str]:
-        """Cases with a governor and with the same gain alone."""
-        both = {"governor", "pip"}
-        return [n for n in LINEAR_CASES if both <= set(known_case(n).designs)]
+    makes: ClassVar[str] = "governor"
+    of_design: ClassVar[tuple[str, ...]] = (*groups["Governor"], *groups["Limits"])
 
     @property
     def _main_design(self) -> Design:
-        return known_case(self.case).designs["governor"]
+        return self.example.designs["governor"]
+
+    def _case_of(self, name: str) -> Case:
+        return _with_governor(known_case(name))
 
     def _welcome(self, name: str) -> None:
-        if name in KEPT and "governor" not in KEPT[name].designs:
-            raise ValueError(
-                f"case = {name!r}: no stabilising gain was found for this model, so "
-                "there is nothing to govern"
-            )
+        if name in KEPT:
+            governed(KEPT[name])
         super()._welcome(name)
+
+    def _case_imports(self) -> tuple[str, ...]:
+        return (*super()._case_imports(), "from nmss_lab.cases import governed")
+
+    def _case_lines(self) -> list[str]:
+        return [*super()._case_lines(), "example = governed(example)"]
 
     def take_case(self, name: str) -> None:
         """Choose a case and the governor's horizon."""
         super().take_case(name)
+        self._offer(PAIR)
+        self.structures = list(PAIR)
         self.Np = self._main_design.horizon.Np
         self.timing = "preview" if self._main_design.reference == "preview" else "held"
 
@@ -813,19 +1068,16 @@ class GovernorChoices(Choices):
         scenario = super().scenario()
         return replace(scenario, reference=self.reference * scenario.reference)
 
-    def designs(self) -> dict[str, Design]:
-        """Pair the governor with its gain alone."""
-        governor, pip = (self.example.designs[name] for name in ("governor", "pip"))
-        options = {**governor.options, **self._reading()}
-        governor = replace(
-            governor,
+    def _changed(self, design: Design) -> Design:
+        design = replace(design, limits=self.limits(design.limits))
+        if design.structure != "governor":
+            return design
+        return replace(
+            design,
             horizon=Horizon(self.Np, self.Np),
-            limits=self.limits(governor.limits),
             reference=self.timing,
-            options=options,
+            options={**design.options, **self._reading()},
         )
-        pip = replace(pip, limits=self.limits(pip.limits))
-        return {"with governor": governor, "without": pip}
 
     def _reading(self) -> dict[str, Any]:
         if self.reading == "zero after step s":
@@ -840,23 +1092,16 @@ class GovernorChoices(Choices):
             ")",
         ]
 
-    def _design_lines(self) -> list[str]:
+    def _changed_lines(self) -> list[str]:
         return [
-            "runs = {}",
-            'for name, key in {"with governor": "governor", "without": "pip"}.items():',
-            "    design = example.designs[key]",
-            "    limits = design.limits",
-            *self._limit_lines(),
-            "    design = replace(design, limits=limits)",
-            '    if key == "governor":',
-            f"        options = {{**design.options, **{self._reading()!r}}}",
-            "        design = replace(",
+            "    designs[name] = design = replace(design, limits=limits)",
+            '    if name == "governor":',
+            "        designs[name] = replace(",
             "            design,",
             f"            horizon=Horizon({self.Np}, {self.Np}),",
             f'            reference="{self.timing}",',
-            "            options=options,",
+            f"            options={{**design.options, **{self._reading()!r}}},",
             "        )",
-            "    runs[name] = closed_loop(plant, design.build(), scenario)",
         ]
 
 
@@ -911,7 +1156,8 @@ def _parts(text: str) -> list[str]:
     return [part for part in text.split(",") if part]
 
 
-def _case_title(example: Case) -> str:
+def case_title(example: Case) -> str:
+    """Section and title of a case."""
     return f"{example.section}  {example.title}".strip()
 
 

@@ -11,6 +11,7 @@ from typing import Any, ClassVar
 import numpy as np
 import param
 
+from apps.kept import KEPT
 from apps.session import DesignChoices, known_case, plain
 from nmss_lab.cases import VARYING_CASES, Case, equation_case
 from nmss_lab.convergence import Best, Iterate, best_plan, iterates
@@ -136,6 +137,13 @@ class VaryingChoices(DesignChoices):
         "Start and disturbances": ("y_start", "u_start", "step_u", "step_y", "step_at"),
     }
     default_case: ClassVar[str] = "product_8_5_2"
+    makes: ClassVar[str] = "state_dependent"
+    of_design: ClassVar[tuple[str, ...]] = (
+        *EQUATION,
+        *groups["Settling"],
+        *groups["Design"],
+        *groups["Limits"],
+    )
 
     def __init__(self, **values: Any) -> None:
         self._own = _own_case(*(type(self).param[key].default for key in EQUATION))
@@ -160,12 +168,11 @@ class VaryingChoices(DesignChoices):
         if name == OWN:
             self._own = _own_case(*(type(self).param[key].default for key in EQUATION))
         example = self._case_of(name)
-        self.param["structures"].objects = list(example.designs)
-        self.structures = []
         for key in ("y_start", "u_start"):
             self.param[key].bounds = (None, None)
         super().take_case(name)
-        self.structures = OPENS_WITH.get(name, ["frozen", "iterated", "gauss_newton"])
+        self._offer(example.designs)
+        self.structures = OPENS_WITH.get(name) or _first_three(example)
         self._fit(example)
 
     def _fit(self, example: Case) -> None:
@@ -176,7 +183,12 @@ class VaryingChoices(DesignChoices):
         self.param["inside"].bounds = (0, last)
         self.inside = min(LOOKS_INTO.get(example.name, 5), last)
         self.output = example.model.n_y - 1
-        self.passes = min(_settling(design).passes, 40)
+        settling = _settling(design)
+        self.passes = min(settling.passes, 40)  # shipped cases answer quickly
+        if example.name in KEPT:  # what was opened is shown as it is
+            self.passes = settling.passes
+            self.damping, self.tolerance = settling.damping, settling.tolerance
+            self.warm_start = "last plan" if settling.warm_start else "frozen model"
         scenario = example.scenario
         for key, value, size in (
             ("y_start", scenario.y0, np.ptp(scenario.reference[:, -1])),
@@ -191,7 +203,8 @@ class VaryingChoices(DesignChoices):
     @property
     def _main_design(self) -> Design:
         designs = self.example.designs
-        return designs.get("iterated") or next(iter(designs.values()))
+        first = next(iter(designs.values()))
+        return first if self.case in KEPT else designs.get("iterated", first)
 
     def accept(self, values: Mapping[str, Any]) -> None:
         """Take over values; an equation that cannot be read leaves the last one.
@@ -227,9 +240,8 @@ class VaryingChoices(DesignChoices):
         }
 
     def _read(self, key: str, value: Any) -> Any:
-        if isinstance(self.param[key], param.String):
-            return str(value)
-        return super()._read(key, value)
+        is_text = key in EQUATION and isinstance(self.param[key], param.String)
+        return str(value) if is_text else super()._read(key, value)
 
     def _item(self, key: str) -> dict[str, Any]:
         parameter = self.param[key]
@@ -271,6 +283,9 @@ class VaryingChoices(DesignChoices):
         model = self.example.equation
         assert model is not None
         return Hasty(model, until=time.monotonic() + PATIENCE)
+
+    def _as_data(self) -> Any:
+        return self.example.plant
 
     def scenario(self) -> Scenario:
         """Scenario of the case from the chosen start, with the chosen disturbances."""
@@ -314,23 +329,15 @@ class VaryingChoices(DesignChoices):
 
     # The same as Python
 
-    def script(self) -> str:
-        """Python that computes what the page shows and prints its measures."""
-        lines = [
-            *_IMPORTS,
-            "",
-            *self._case_lines(),
-            *self._start_lines(),
-            *self._scenario_lines(),
-            "",
-            "runs = {}",
-            f"for name in {list(self.structures)!r}:",
-            "    design = example.designs[name]",
-            "    limits = design.limits",
-            *self._limit_lines(),
-            "    design = replace(design, limits=limits)",
+    def _plant_lines(self) -> list[str]:
+        return ["plant = example.plant"]
+
+    def _changed_lines(self) -> list[str]:
+        return [
+            "    designs[name] = design = replace(design, limits=limits)",
             '    if design.structure == "sdp_governor":',
-            f"        design = replace(design, horizon=Horizon({self.Np}, {self.Np}))",
+            f"        horizon = Horizon({self.Np}, {self.Np})",
+            "        designs[name] = replace(design, horizon=horizon)",
             '    if "settling" in design.options:',
             "        settling = replace(",
             '            design.options["settling"],',
@@ -339,23 +346,26 @@ class VaryingChoices(DesignChoices):
             f"            passes={self.passes!r},",
             f"            warm_start={self.warm_start == 'last plan'},",
             "        )",
-            "        design = replace(",
+            "        designs[name] = replace(",
             "            design,",
             f"            horizon=Horizon({self.Np}, {self.Nc}),",
             f"            Q={self.weight_y!r} * np.asarray(design.Q),",
             f"            R={self.weight_move!r} * np.asarray(design.R),",
             '            options={**design.options, "settling": settling},',
             "        )",
-            "    runs[name] = closed_loop(example.plant, design.build(), scenario)",
-            "",
-            f"for row in table(runs, channel={self.output}):",
-            "    print(row)",
         ]
-        return "\n".join(lines) + "\n"
+
+    def _case_imports(self) -> tuple[str, ...]:
+        if self.case != OWN:
+            return super()._case_imports()
+        return (
+            "from nmss_lab.cases import equation_case",
+            "from nmss_lab.state_dependent import StateDependentModel",
+        )
 
     def _case_lines(self) -> list[str]:
         if self.case != OWN:
-            return [f'example = case("{self.case}")']
+            return super()._case_lines()
         equation = self.example.equation
         assert equation is not None
         a = [entry for ((entry,),) in equation.a]
@@ -365,27 +375,19 @@ class VaryingChoices(DesignChoices):
             f"example = equation_case(model, {self.target!r})",
         ]
 
-    def _start_lines(self) -> list[str]:
-        scenario, n_y = self.scenario(), self.example.model.n_y
-        y0 = [float(value) for value in np.ravel(scenario.y0)]
-        lines = [
-            "example_scenario = replace(",
-            f"    example.scenario, y0=np.array({y0!r}), u0={self.u_start!r}",
-            ")",
-        ]
-        if scenario.manual is not None:
-            lines += [
-                "manual = np.where(",
-                f"    np.isfinite(example_scenario.manual), {self.u_start!r}, np.nan",
-                ")",
-                "example_scenario = replace(example_scenario, manual=manual)",
-            ]
-        assert n_y == len(y0)
-        return lines
-
     def _scenario_lines(self) -> list[str]:
         first, *others = super()._scenario_lines()
-        return [first.replace("example.scenario", "example_scenario"), *others]
+        scenario = self.scenario()
+        y0 = [float(value) for value in np.ravel(scenario.y0)]
+        start = f"y0=np.array({y0!r}), u0={self.u_start!r}"
+        lines = [first, f"scenario = replace(scenario, {start})"]
+        if scenario.manual is not None:
+            by_hand = "np.isfinite(scenario.manual)"
+            lines += [
+                f"manual = np.where({by_hand}, {self.u_start!r}, np.nan)",
+                "scenario = replace(scenario, manual=manual)",
+            ]
+        return [*lines, *others]
 
 
 NOT_RUN = "inside", "output", "input"
@@ -399,20 +401,14 @@ def _own_case(a1: str, a2: str, b1: str, b2: str, target: float) -> Case:
     return equation_case(StateDependentModel(a, b), target)
 
 
+def _first_three(example: Case) -> list[str]:
+    """Structures a case opens with: three schemes, a design of one's own first."""
+    first = next(iter(example.designs))
+    others = [name for name in ("frozen", "iterated", "gauss_newton") if name != first]
+    return [first, *others][:3]
+
+
 def _settling(design: Design) -> Settling:
     settling = design.options.get("settling", Settling())
     assert isinstance(settling, Settling)
     return settling
-
-
-_IMPORTS = (
-    "from dataclasses import replace",
-    "",
-    "import numpy as np",
-    "",
-    "from nmss_lab.cases import case, equation_case, piecewise",
-    "from nmss_lab.measures import table",
-    "from nmss_lab.predict import Horizon",
-    "from nmss_lab.simulate import closed_loop",
-    "from nmss_lab.state_dependent import StateDependentModel",
-)

@@ -22,10 +22,58 @@ from nmss_lab.models import Array, DifferenceModel, LinearPlant
 from nmss_lab.mpc import state_weight
 from nmss_lab.pip import lq_gain, pole_gain
 from nmss_lab.predict import Horizon
-from nmss_lab.sdp_mpc import Settling
+from nmss_lab.sdp_mpc import SDP_STRUCTURES, Settling
 from nmss_lab.simulate import Scenario
 from nmss_lab.state_dependent import StateDependentModel, StateDependentPlant
 from nmss_lab.uncertainty import Intervals
+
+
+@dataclass(frozen=True)
+class Zone:
+    """Rectangle on a floor plan, in metres from the corner of the plan.
+
+    ``output`` is the number of the output that is its temperature, None where the
+    model has none.
+    """
+
+    name: str
+    place: str
+    left: float
+    length: float
+    output: int | None = None
+
+
+@dataclass(frozen=True)
+class Actuator:
+    """Place of an input on the long wall of a floor plan, in metres from its corner."""
+
+    name: str
+    at: float
+    input: int
+
+
+@dataclass(frozen=True)
+class FloorPlan:
+    """Schematic plan of a building whose outputs are the temperatures of zones.
+
+    Parameters
+    ----------
+    length, width : float
+        Metres; a zone is as wide as the building.
+    zones : tuple of Zone
+    actuators : tuple of Actuator
+    outside : int
+        Number of the measured disturbance that is the temperature around it.
+    full : float
+        Deviation from the reference at which a colour is full.
+    """
+
+    length: float
+    width: float
+    zones: tuple[Zone, ...]
+    actuators: tuple[Actuator, ...]
+    outside: int
+    full: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +102,8 @@ class Case:
         Plant in continuous time, where there is one.
     covariance : array, optional
         Covariance of the model's parameters, in the order a_1 ... a_na, b_1 ... b_nb.
+    plan : FloorPlan, optional
+        Where its outputs and inputs are, if it is a building.
     """
 
     name: str
@@ -67,6 +117,7 @@ class Case:
     bands: Mapping[str, tuple[Any, Any]] = field(default_factory=dict)
     continuous: ContinuousPlant | None = None
     covariance: Array | None = None
+    plan: FloorPlan | None = None
 
     @property
     def model(self) -> DifferenceModel:
@@ -795,6 +846,20 @@ def temperature_scenario(
     return Scenario(np.full((samples, 2), 23.0), v=v, u0=start, v0=v[0])
 
 
+TEMPERATURE_PLAN = FloorPlan(
+    length=12.0,
+    width=4.0,
+    zones=(
+        Zone("Group I", "front wall", 0.0, 4.0, 0),
+        Zone("Group III", "middle", 4.0, 4.0),
+        Zone("Group II", "back wall", 8.0, 4.0, 1),
+    ),
+    actuators=(Actuator("Ventilation", 2.0, 0), Actuator("Inlet air", 8.0, 1)),
+    outside=0,
+    full=1.0,
+)
+
+
 def temperature_7_4_2() -> Case:
     """Build the temperature installation with synthetic surroundings."""
     model = temperature_model()
@@ -835,10 +900,16 @@ def temperature_7_4_2() -> Case:
             "Both groups can be held at 23 degC only for surroundings between about "
             "21.3 and 23.1 degC.",
             "The loop starts at the equilibrium for the first surrounding temperature.",
+            "The floor plan is schematic. From the thesis: 12 m by 4 m, in a large "
+            "room, sensors of group I near the front wall, of group II near the back "
+            "wall, and between them those of group III, which is not controlled. "
+            "Assumed: that front and back are the short walls, that zones are equal, "
+            "and where ventilation and inlet are.",
             "wang_young, forward_path, minimal and integral_of_error ignore the "
             "measured disturbance; the last is our addition.",
         ),
         bands={"within 1 degC": (22.0, 24.0)},
+        plan=TEMPERATURE_PLAN,
     )
 
 
@@ -1056,6 +1127,132 @@ def model_case(
             f"({slowest:.4g}), the delay and the gains.",
         ),
         covariance=covariance,
+    )
+
+
+def design_case(
+    design: Design, plant: Any = None, scenario: Scenario | None = None
+) -> Case:
+    """Case that shows a design of one's own, such as one read from a file.
+
+    Parameters
+    ----------
+    design : Design
+    plant : LinearPlant, ContinuousPlant, StateDependentPlant or a model, optional
+        The design's model by default.
+    scenario : Scenario, optional
+        By default the reference of each output steps from 0 to 1, one after the other.
+
+    Returns
+    -------
+    Case
+        Named "your_design"; its first design is the given one, and a gain comes with a
+        governor, a governor with its gain alone.
+
+    Examples
+    --------
+    >>> model = DifferenceModel([-0.9], [0.1])
+    >>> example = design_case(Design("wang_young", model))
+    >>> list(example.designs), len(example.scenario)
+    (['wang_young'], 65)
+    """
+    model, assumed = design.model, []
+    if plant is None:
+        assumed.append("The plant is the model itself.")
+    given, continuous = model if plant is None else plant, None
+    if isinstance(given, ContinuousPlant):
+        continuous, given = given, given.sampled(model.dt)
+    if isinstance(given, DifferenceModel | StateDependentModel):
+        given = given.plant()
+    if scenario is None:
+        assumed.append("The reference of each output steps from 0 to 1 in turn.")
+        each = max(2 * design.horizon.Np, 40) + 20
+        steps = [
+            (5 + i * each, np.eye(model.n_y)[: i + 1].sum(axis=0))
+            for i in range(model.n_y)
+        ]
+        scenario = Scenario(piecewise(5 + model.n_y * each, *steps))
+    return Case(
+        name="your_design",
+        title=f"Your design, {design.structure.replace('_', ' ')}",
+        section="",
+        source="Read from a file",
+        plant=given,
+        designs={design.structure: design, **_companions(design)},
+        scenario=scenario,
+        notes=tuple(assumed),
+        continuous=continuous,
+    )
+
+
+def _companions(design: Design) -> dict[str, Design]:
+    """Designs that belong beside one: what a page shows together."""
+    model, K = design.model, design.options.get("K")
+    if isinstance(model, StateDependentModel):
+        moves = Design("sdp_increments", model, design.horizon, limits=design.limits)
+        return _schemes(design if design.structure in SDP_STRUCTURES else moves)
+    if design.structure == "governor":
+        return {"pip": Design("pip", model, limits=design.limits, options={"K": K})}
+    if design.structure == "pip":
+        horizon = Horizon(design.horizon.Np, design.horizon.Np)
+        governor = Design("governor", model, horizon, limits=design.limits)
+        return {"governor": dataclasses.replace(governor, options={"K": K})}
+    return {}
+
+
+def governed(example: Case) -> Case:
+    """Case with a gain and with a governor of its reference, where it has none.
+
+    The gain is that of its "pip", or the linear-quadratic one of the weights of its
+    first integral-of-error design that has one.
+
+    Parameters
+    ----------
+    example : Case
+
+    Raises
+    ------
+    ValueError
+        If the case is state-dependent, or no gain was found.
+
+    Examples
+    --------
+    >>> sorted(governed(wood_berry()).designs.keys() - wood_berry().designs.keys())
+    ['governor', 'pip']
+    """
+    designs = dict(example.designs)
+    if {"pip", "governor"} <= set(designs):
+        return example
+    if example.equation is not None:
+        raise ValueError(f"{example.name}: a state-dependent plant has governors else")
+    first = next(iter(designs.values()))
+    K, source = _gain_of(example)
+    Np = min(first.horizon.Np, 40)
+    pip = Design("pip", first.model, limits=first.limits, options={"K": K})
+    governor = dataclasses.replace(pip, structure="governor", horizon=Horizon(Np, Np))
+    note = f"The governor is over the gain {source}, with the limits of the case."
+    return dataclasses.replace(
+        example,
+        designs={**designs, "pip": designs.get("pip", pip), "governor": governor},
+        notes=(note, *example.notes),
+    )
+
+
+def _gain_of(example: Case) -> tuple[Array, str]:
+    """Find a proportional-integral-plus gain, and say where it is from."""
+    pip = example.designs.get("pip")
+    if pip is not None:
+        return pip.options["K"], "of the case's PIP design"
+    for name, design in example.designs.items():
+        if design.structure == "integral_of_error":
+            try:
+                K = lq_gain(example.model, design.Q, design.R)
+            except ValueError:
+                continue
+            return K, f"of the linear-quadratic law with the weights of {name}"
+    raise ValueError(
+        f"{example.name}: no stabilising gain was found for this model, so there is "
+        "nothing to govern"
     )
 
 

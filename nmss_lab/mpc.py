@@ -207,8 +207,9 @@ def disturbance_direct(
 ) -> PredictiveController:
     """Measured disturbances as known offsets of the prediction (thesis 7.2.2).
 
-    ``forecast`` says what is known of v beyond v_k: it is held (Assumption 7.3.1),
-    handed to ``decide`` ("given"), or asked of a function, see ``Forecast``.
+    ``forecast`` says what is known of v beyond v_k: it is held (Assumption 7.3.1), goes
+    on along the line through the latest two values ("line"), is handed to ``decide``
+    ("given"), or asked of a function, see ``Forecast``.
 
     Raises
     ------
@@ -310,9 +311,10 @@ class Setup:
             raise ValueError(
                 f'reference = "{self.reading}": expected one of {", ".join(sizes)}'
             )
-        if not (callable(self.forecast) or self.forecast in ("held", "given")):
+        if not (callable(self.forecast) or self.forecast in ("held", "line", "given")):
             raise ValueError(
-                f'forecast = "{self.forecast}": expected "held", "given" or a function'
+                f'forecast = "{self.forecast}": expected "held", "line", "given" or a '
+                "function"
             )
         model = self.model
         return Layout(

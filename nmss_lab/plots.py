@@ -31,14 +31,16 @@ from bokeh.models import (
 )
 from bokeh.plotting import figure
 
+from nmss_lab.comparison import Score
 from nmss_lab.controller import Status
 from nmss_lab.convergence import Best, Iterate
 from nmss_lab.identify import Estimate, pole_draws, step_band, step_response
 from nmss_lab.models import Array
 from nmss_lab.montecarlo import MonteCarlo
 from nmss_lab.predictive import PredictiveController
+from nmss_lab.qp import Row
 from nmss_lab.records import Record
-from nmss_lab.simulate import Run
+from nmss_lab.simulate import DIVERGED, Run
 
 STYLES = (
     {"color": "#0072B2", "dash": (), "marker": "circle"},
@@ -139,8 +141,8 @@ class Chart:
         Whether values are whole numbers.
     across : str
         What lies on the horizontal axis.
-    log : bool
-        Whether the vertical axis is logarithmic.
+    log, log_across : bool
+        Whether the vertical and the horizontal axis are logarithmic.
     origin, step : float, optional
         Where trails begin and how far their values are apart, if trails do not move
         with the samples but are versions of one prediction.
@@ -157,6 +159,7 @@ class Chart:
     counts: bool = False
     across: str = "time"
     log: bool = False
+    log_across: bool = False
     origin: float | None = None
     step: float | None = None
 
@@ -243,7 +246,7 @@ def loop_charts(
 def governor_charts(
     runs: Mapping[str, Run], output: int = 0, input: int = 0
 ) -> list[Chart]:
-    """Charts of a loop with a governor, the first run, beside the loop without.
+    """Charts of loops with a governor beside loops without.
 
     Returns
     -------
@@ -253,31 +256,111 @@ def governor_charts(
     Raises
     ------
     ValueError
-        As ``loop_charts``, or if the first run has no governor.
+        As ``loop_charts``, or if no run has a governor.
     """
     plain = loop_charts(runs, output, input)[:3]
-    name, governed = next(iter(runs.items()))
-    ahead = 0 if getattr(governed.controller, "causal", True) else 1
-    model = governed.controller.model
+    first = next(iter(runs.values()))
+    model = first.controller.model
     unit = _unit(model.units.get(model.y_names[output], ""))
-    t, r, w = governed.t, governed.r[:, output], governed.w[:, output]
-    planned_w = governed.trail("w")[:, :, output]
-    planned_beta = governed.trail("beta")[:, :, output]
+    t, r = first.t, first.r[:, output]
+    bent: dict[str, list[Curve]] = {"w": [], "beta": []}
+    for style, (name, run) in enumerate(runs.items()):
+        if "beta" not in getattr(run.controller, "signals", ()):
+            continue
+        ahead = 0 if getattr(run.controller, "causal", True) else 1
+        w = run.w[:, output]
+        for signal, values in (("w", w), ("beta", w - r)):
+            trail = run.trail(signal)[:, :, output]
+            label = f"{signal}, {name}"
+            bent[signal].append(Curve(label, t, values, True, style, trail, ahead))
+    if not bent["w"]:
+        raise ValueError("none of these runs has a governor: choose one")
     reference = Chart(
         "reference",
         "Reference r and governed w",
         f"r, w{unit}",
-        (Curve(f"w, {name}", t, w, True, 0, planned_w, ahead),),
+        tuple(bent["w"]),
         (Curve("reference r", t, r, held=True),),
     )
     beta = Chart(
         "beta",
         "Perturbation of the reference",
         f"\u03b2 = w \u2212 r{unit}",
-        (Curve(f"beta, {name}", t, w - r, True, 0, planned_beta, ahead),),
+        tuple(bent["beta"]),
         (Curve("zero", t, np.zeros(len(t)), held=True),),
     )
-    return [*plain, *(_timed(chart, governed) for chart in (reference, beta))]
+    return [*plain, *(_timed(chart, first) for chart in (reference, beta))]
+
+
+def disturbance_charts(
+    runs: Mapping[str, Run], output: int = 0, input: int = 0, disturbance: int = 0
+) -> list[Chart]:
+    """Charts of loops with and without a measured disturbance.
+
+    The disturbance itself is a reference curve; trails show what the plans of each
+    sample took it to be.
+
+    Returns
+    -------
+    list of Chart
+        Named "output", "input", "disturbance", "increment" and "error".
+
+    Raises
+    ------
+    ValueError
+        As ``loop_charts``, or if there is no such disturbance.
+    """
+    output_chart, input_chart, increment = loop_charts(runs, output, input)[:3]
+    first = next(iter(runs.values()))
+    model, t = first.controller.model, first.t
+    if not 0 <= disturbance < model.n_v:
+        raise ValueError(
+            f"disturbance = {disturbance}: the model has {model.n_v} measured ones"
+        )
+    y, v = model.y_names[output], model.v_names[disturbance]
+    in_y, in_v = (_unit(model.units.get(name, "")) for name in (y, v))
+    expected = {
+        style: (name, _expected(run, disturbance))
+        for style, (name, run) in enumerate(runs.items())
+    }
+    measured = Chart(
+        "disturbance",
+        "v, measured and expected",
+        f"{v}{in_v}",
+        tuple(
+            Curve(name, np.zeros(0), np.zeros(0), True, style, trail)
+            for style, (name, trail) in expected.items()
+            if trail is not None
+        ),
+        (Curve("disturbance v", t, first.v[:, disturbance], held=True),),
+    )
+    error = Chart(
+        "error",
+        "Deviation from the reference",
+        f"y \u2212 r{in_y}",
+        _curves(runs, lambda run: run.y[:, output] - run.r[:, output]),
+        (Curve("zero", t, np.zeros(len(t)), held=True),),
+    )
+    measured, error = (_timed(chart, first) for chart in (measured, error))
+    return [output_chart, input_chart, measured, increment, error]
+
+
+def _expected(run: Run, channel: int) -> Array | None:
+    """Disturbance over the horizon as each plan took it, (N, Np), v_k first.
+
+    None for plans that know none; not a number where an older plan was continued.
+    """
+    controller, moves = run.controller, run.moves
+    known = isinstance(controller, PredictiveController) and controller.form.lags
+    if not known or moves is None:
+        return None
+    assert isinstance(controller, PredictiveController)
+    ahead = controller.knowledge.layout.read(moves.known, "dv_ahead")[..., channel]
+    changes = np.zeros((len(run), controller.horizon.Np))
+    changes[:, 1 : 1 + ahead.shape[1]] = ahead
+    changes[moves.shift != 0] = np.nan
+    expected: Array = run.v[:, [channel]] + changes.cumsum(axis=1)
+    return expected
 
 
 def varying_charts(
@@ -314,7 +397,7 @@ def varying_charts(
     return [_flagged(c, flags) if c.name in FLAGGED else c for c in charts]
 
 
-LOW = "increment", "cost", "decrease", "passes"
+LOW = "increment", "cost", "decrease", "passes", "S_o", "S_i", "disturbance", "error"
 """Charts that pages show with little height: few ticks."""
 
 FLAGGED = "output", "cost", "passes"
@@ -975,19 +1058,25 @@ def _held_rows(rows: Sequence[Any], model: Any) -> str:
     """Names of limits and the steps of the horizon at which they hold."""
     if not rows:
         return ""
-    names = {"u": model.u_names, "du": model.u_names, "y": model.y_names}
 
     def key(row: Any) -> tuple[str, int]:
         return row.name, row.channel
 
     parts = []
-    for (name, channel), group in itertools.groupby(sorted(rows, key=key), key):
-        steps = sorted(row.step for row in group)
-        known = names.get(name)
-        label = known[channel] if known else "end"
-        before = {"du": "change of ", "u": "", "y": ""}.get(name, f"{name} ")
-        parts.append(f"{before}{label} {_steps(steps)}")
+    for _, group in itertools.groupby(sorted(rows, key=key), key):
+        together = list(group)
+        steps = sorted(row.step for row in together)
+        parts.append(f"{row_in_words(together[0], model)[0]} {_steps(steps)}")
     return f"At a limit: {'; '.join(parts)}."
+
+
+def row_in_words(row: Row, model: Any) -> tuple[str, str]:
+    """Signal that a row of a program limits, in words, and its unit."""
+    names = {"u": model.u_names, "du": model.u_names, "y": model.y_names}
+    known = names.get(row.name)
+    label = known[row.channel] if known else "end"
+    before = {"du": "change of ", "u": "", "y": ""}.get(row.name, f"{row.name} ")
+    return f"{before}{label}", model.units.get(label, "")
 
 
 def _steps(steps: Sequence[int]) -> str:
@@ -1022,7 +1111,7 @@ class ChartFigure:
 
     def __init__(self, chart: Chart, times: Range1d | None = None) -> None:
         times = times or Range1d(*chart.span)
-        self.figure = _empty_figure(chart.name, times, chart.log)
+        self.figure = _empty_figure(chart, times)
         self.curves = [ColumnDataSource({"t": [], "y": []}) for _ in STYLES]
         self.flags = [ColumnDataSource({"t": [], "y": []}) for _ in STYLES]
         self.references = ColumnDataSource({"t": [], "y": []})
@@ -1041,7 +1130,8 @@ class ChartFigure:
             self.figure.add_layout(line)
         hover = HoverTool(
             renderers=self._lines,
-            tooltips=[("time", "@t{0.00}"), ("value", "@y{0.0000}")],
+            tooltips=[(chart.across, "@t{%.4g}"), ("value", "@y{%.4g}")],
+            formatters={"@t": "printf", "@y": "printf"},
             mode="mouse",
         )
         self.figure.add_tools(hover)
@@ -1159,10 +1249,11 @@ def _add_flags(plot: figure, source: ColumnDataSource, number: int) -> None:
     flags.name = f"flag{number}"
 
 
-def _empty_figure(name: str, times: Range1d | DataRange1d, log: bool = False) -> figure:
+def _empty_figure(chart: Chart, times: Range1d | DataRange1d) -> figure:
     plot = figure(
-        name=name,
-        y_axis_type="log" if log else "linear",
+        name=chart.name,
+        x_axis_type="log" if chart.log_across else "linear",
+        y_axis_type="log" if chart.log else "linear",
         height=220,
         sizing_mode="stretch_both",
         x_range=times,
@@ -1649,3 +1740,167 @@ class EnsembleFigure(EstimateFigure):
             curve = with_style.get(style)
             _fill(self.lines[style], None if curve is None or curve.marks else curve)
             _fill(self.rings[style], curve if curve and curve.marks else None)
+
+
+# Structures side by side
+
+FREQUENCIES = np.geomspace(1e-3, 1.0, 240)
+"""Shares of Nyquist's frequency at which gains are drawn."""
+
+
+def comparison_charts(
+    scores: Mapping[str, Score], output: int = 0, input: int = 0
+) -> list[Chart]:
+    """Charts of scored designs side by side.
+
+    Parameters
+    ----------
+    scores : mapping of str to Score
+        Up to three, by name, of one scenario.
+    output, input : int
+        Which channels are shown over time.
+
+    Returns
+    -------
+    list of Chart
+        Named "output" and "input", over time; "S_o" and "S_i", largest singular
+        values over frequency; and "poles", for ``PoleFigure``, with hidden modes.
+
+    Raises
+    ------
+    ValueError
+        As ``loop_charts``.
+    """
+    runs = {name: score.run for name, score in scores.items()}
+    with np.errstate(all="ignore"):  # of loops that run away
+        charts = loop_charts(runs, output, input)[:2]
+    ends = _where_gone(runs, output)
+    response, moves = (_until(chart, ends) for chart in charts)
+    clouds = [
+        _pole_cloud(name, score.loop.poles, None, style, score.hidden_modes)
+        for style, (name, score) in enumerate(scores.items())
+    ]
+    poles = _z_plane("Poles; crossed: hidden modes", clouds)
+    return [response, moves, *_gain_charts(scores), poles]
+
+
+def _where_gone(runs: Mapping[str, Run], output: int) -> list[float]:
+    """Last times at which loops are near, as a chart has them, others in sight."""
+    sizes = {name: np.abs(run.y[:, output]) for name, run in runs.items()}
+    peaks = [float(np.nan_to_num(size, nan=np.inf).max()) for size in sizes.values()]
+    least = min(peaks)
+    first = next(iter(runs.values()))
+    far = float(np.abs(first.r[:, output]).max())
+    far = 10.0 * max(far, least if least < DIVERGED else 0.0, 1e-9)
+    ends = []
+    for run, size in zip(runs.values(), sizes.values(), strict=True):
+        gone = ~(size < far)
+        last = int(np.argmax(gone)) if gone.any() else len(run) - 1
+        ends.append(float(run.t[last] / time_unit(run)[0]))
+    return ends
+
+
+def _until(chart: Chart, ends: Sequence[float]) -> Chart:
+    """Chart whose curves, one a loop, end at given times."""
+    curves = []
+    for curve in chart.curves:
+        there = curve.t <= ends[curve.style]
+        cut = dataclasses.replace(curve, t=curve.t[there], values=curve.values[there])
+        curves.append(cut)
+    return dataclasses.replace(chart, curves=tuple(curves))
+
+
+def _gain_charts(scores: Mapping[str, Score]) -> list[Chart]:
+    """Charts of S_o and S_i up to Nyquist's frequency, where they are finite."""
+    first = next(iter(scores.values())).run.controller.model
+    omega = FREQUENCIES * np.pi / first.dt
+    single = first.n_y == first.n_u == 1
+    units = {first.units.get(name, "") for name in (*first.y_names, *first.u_names)}
+    unit = "-" if len(units) == 1 else "y/u"
+    charts = []
+    for which, where, letter, axis in (
+        ("S_o", "output", "d_y", "S_o [-]"),
+        ("S_i", "input", "d_u", f"S_i [{unit}]"),
+    ):
+        title = f"Disturbance at the {where} to y"
+        title = title if single else f"{letter} to y, largest singular value"
+        curves = []
+        for style, (name, score) in enumerate(scores.items()):
+            gains = score.loop.singular_values(which, omega)[:, 0]  # type: ignore[arg-type]
+            there = np.isfinite(gains) & (gains > 0.0)
+            t, values = omega[there], gains[there]
+            curves.append(Curve(name, t, values, style=style))
+        one = (Curve("1", omega[[0, -1]], np.ones(2)),) if which == "S_o" else ()
+        charts.append(
+            Chart(
+                which,
+                title,
+                axis,
+                tuple(curves),
+                one,
+                samples=omega,
+                unit="rad/s",
+                across="frequency",
+                log=True,
+                log_across=True,
+            )
+        )
+    return charts
+
+
+class PoleFigure(ChartFigure):
+    """A figure of poles: open markers, and crosses where modes are hidden."""
+
+    def __init__(self, chart: Chart, times: Range1d | None = None) -> None:
+        columns = "t", "y", "modulus"
+        self.rings, self.crosses = (
+            [ColumnDataSource({key: [] for key in columns}) for _ in STYLES]
+            for _ in range(2)
+        )
+        super().__init__(chart, times)
+        drawn = []
+        for style, kinds in enumerate(zip(self.rings, self.crosses, strict=True)):
+            for kind, source, marker, size in (
+                ("ring", kinds[0], STYLES[style]["marker"], 13 + 3 * style),
+                ("cross", kinds[1], "x", 13),
+            ):
+                points = self.figure.scatter(
+                    "t",
+                    "y",
+                    source=source,
+                    marker=str(marker),
+                    size=size,
+                    fill_color=None,
+                    line_color=STYLES[style]["color"],
+                    line_width=2.2,
+                )
+                points.name = f"{kind}{style}"
+                drawn.append(points)
+        hover = HoverTool(
+            renderers=drawn,
+            tooltips=[("real", "@t"), ("imaginary", "@y"), ("modulus", "@modulus")],
+            mode="mouse",
+        )
+        self.figure.add_tools(hover, "pan", "wheel_zoom")
+        self.figure.toolbar.active_scroll = None
+
+    def show(self, chart: Chart) -> None:
+        """Draw other poles."""
+        super().show(dataclasses.replace(chart, curves=()))
+        low, high = chart.vertical
+        self.figure.y_range.update(start=low, end=high)
+        with_style = {curve.style: curve for curve in chart.curves}
+        for style in range(len(STYLES)):
+            curve = with_style.get(style)
+            poles = np.zeros(0, dtype=complex)
+            poles = poles if curve is None else curve.t + 1j * curve.values
+            crosses = getattr(curve, "crosses", None)
+            hidden = np.zeros(0, dtype=complex) if crosses is None else crosses
+            self.rings[style].data = _place_columns(poles)
+            self.crosses[style].data = _place_columns(hidden)
+
+
+def _place_columns(poles: Any) -> dict[str, Array]:
+    """Places of poles and their distance from the origin."""
+    columns = {"t": poles.real, "y": poles.imag, "modulus": np.abs(poles)}
+    return {key: part.astype(np.float32) for key, part in columns.items()}

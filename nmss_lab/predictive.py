@@ -24,10 +24,10 @@ from nmss_lab.regions import Regions
 
 LOG = logging.getLogger(__name__)
 
-Forecast = Literal["held", "given"] | Callable[[Array, int], Array]
-"""Measured disturbances ahead: v_k held, handed to ``decide``, or a function of the
-latest values (ng + 1, n_v), v_k first, and of the number of samples ahead that
-returns (samples, n_v)."""
+Forecast = Literal["held", "line", "given"] | Callable[[Array, int], Array]
+"""Measured disturbances ahead: v_k held, on along the line through the latest two
+values, handed to ``decide``, or a function of the latest values (ng + 1, n_v), v_k
+first, and of the number of samples ahead that returns (samples, n_v)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,7 +163,7 @@ class PredictiveController(Controller):
         Order in which rows give way when not all can be kept, the highest first;
         -1 for rows that never do.
     backend : str
-    forecast : "held", "given" or a function, see ``Forecast``
+    forecast : "held", "line", "given" or a function, see ``Forecast``
     anti_windup : bool
         Whether a sum of the error stops growing while a level limit holds the input.
     regions : Regions, optional
@@ -322,8 +322,9 @@ class PredictiveController(Controller):
         if knows.from_r.any():
             theta += r.reshape(loops, -1) @ knows.from_r.T
         if knows.from_v.any():
-            if callable(self.forecast):
-                v = self._ask_forecast(self.forecast, vector)
+            asked = _line if self.forecast == "line" else self.forecast
+            if callable(asked):
+                v = self._ask_forecast(asked, vector)
             theta += v.reshape(loops, -1) @ knows.from_v.T
         return theta
 
@@ -411,6 +412,12 @@ class PredictiveController(Controller):
     @cached_property
     def _move_steps(self) -> Array:
         return np.unique([row.step for row in self.program.labels if row.name == "u"])
+
+
+def _line(latest: Array, steps: int) -> Array:
+    """Go on as the latest two values went, (steps, n_v)."""
+    ahead: Array = np.arange(1.0, steps + 1.0)[:, None] * (latest[0] - latest[1])
+    return latest[0] + ahead
 
 
 def _close(u: Array, side: Array) -> Array:

@@ -14,6 +14,7 @@ from nmss_lab.models import Array, DifferenceModel, LinearPlant, Numbers, Plant
 from nmss_lab.parallel import in_order
 from nmss_lab.predictive import PredictiveController
 from nmss_lab.qp import one_by_one
+from nmss_lab.records import Record
 from nmss_lab.state_dependent import StateDependentModel
 
 Equation = DifferenceModel | StateDependentModel
@@ -162,6 +163,16 @@ class Run:
     def __len__(self) -> int:
         """Return the number of samples."""
         return len(self.t)
+
+    def record(self) -> Record:
+        """Return what an engineer would have recorded: r, y, u and v at the samples."""
+        model = self.controller.model
+        names = {"y": tuple(model.y_names), "u": tuple(model.u_names)}
+        if model.n_v:
+            names["v"] = tuple(model.v_names)
+        v = self.v if model.n_v else self.v[:, :0]
+        units = {"time": "s", **model.units}
+        return Record(self.t, self.y, self.u, v, self.r, names, units)
 
     @property
     def active(self) -> Array:

@@ -697,7 +697,7 @@ class _Search:
 
         scipy.optimize.minimize(
             merit,
-            centre,
+            np.clip(centre, low, high),
             method="Nelder-Mead",
             bounds=list(zip(low, high, strict=True)),
             options={

@@ -16,7 +16,7 @@ from playwright.sync_api import expect
 
 from apps.pages import governor, receding_horizon
 from apps.pages.live import LivePage, Subject
-from apps.session import Choices, GovernorChoices, LoopChoices, plain
+from apps.session import HELD, Choices, GovernorChoices, LoopChoices, plain
 from nmss_lab.measures import table
 from nmss_lab.plots import Chart, busiest_sample, draw, loop_charts, pack, sentences
 
@@ -44,7 +44,9 @@ def test_every_choice_is_explained(kind: type[Choices]) -> None:
     """Each control has a label and one sentence of help, each slider has bounds."""
     choices = kind()
     shown = [item for group in choices.description() for item in group["items"]]
-    assert {item["name"] for item in shown} | {"input", "output"} == set(kind.names())
+    assert {item["name"] for item in shown} | {"input", "output", *HELD} == set(
+        kind.names()
+    )
     for item in shown:
         assert item["label"]
         assert item["help"].endswith(".")

@@ -12,6 +12,7 @@ from test_dashboard import anything, script_computes_what_is_shown, sliders
 
 from apps.pages import state_dependent
 from apps.pages.live import LivePage
+from apps.session import HELD
 from apps.varying import OWN, VaryingChoices
 from nmss_lab.cases import VARYING_CASES
 from nmss_lab.controller import Status
@@ -28,7 +29,7 @@ def test_every_choice_is_explained() -> None:
     """Each control has a label and a sentence of help, each slider has bounds."""
     choices = VaryingChoices(case=OWN)
     shown = [item for group in choices.description() for item in group["items"]]
-    assert {item["name"] for item in shown} | {"input", "output"} == set(
+    assert {item["name"] for item in shown} | {"input", "output", *HELD} == set(
         choices.names()
     )
     assert all(item["label"] and item["help"].endswith(".") for item in shown)

@@ -286,7 +286,7 @@ def test_a_session_without_a_browser() -> None:
     tuned = page.place.after
     assert isinstance(tuned, Design)
     assert page.goals.progress["attainment"] < 0.1
-    act("keep", which="A")
+    page.bar.sent = {"act": "hold", "which": "A", "name": "tuned", "number": 1}
     act("continue")
     assert page.place.before is tuned
     act("undo")
@@ -304,7 +304,7 @@ def test_a_session_without_a_browser() -> None:
     act("tune")
     assert "hard" in page.complaint
     page.controls.sent = {**page.choices.values(), "case": "shell_5_3_2", "message": 1}
-    assert page.kept == {}
+    assert "1 outputs, this plant has 3" in page.bar.told["held"]["A"]["misfit"]
     assert page.place.after is None
     assert len(page.goals.state["rows"]) == 6
 
@@ -438,7 +438,7 @@ def test_bars_move_and_the_page_answers(visit: Open, server: Server) -> None:
     slider.fill("1")
     page.wait_for_function("nmssTune.idle()")
     assert factor(page) < before
-    press(page, "Undo")
+    press(page, "Undo tuning")
     page.wait_for_function("!nmssTune.progress().undo")
     assert factor(page) == before
     assert server.faults() == []
@@ -486,21 +486,29 @@ def test_coupling_is_shown_cell_by_cell(visit: Open) -> None:
     expect(page.locator(".coupling-box")).to_be_hidden()
 
 
+def hold(page: Page, which: str, name: str) -> None:
+    """Hold a design by the menu of the bar."""
+    page.locator("summary", has_text=f"{which}:").click()
+    page.get_by_role("button", name=f"{name} as {which}").click()
+    page.wait_for_function(READY)
+
+
 def test_designs_are_kept_and_sent(visit: Open, server: Server) -> None:
     """A and B are compared with the present one; it goes to another page and a file."""
     page = visit("tune?most=60&starts=1")
-    press(page, "Keep as A")
+    hold(page, "A", "before")
     search(page)
-    press(page, "Keep as B")
+    hold(page, "B", "tuned")
     page.locator("select[name=structure]").select_option('"wang_young"')
     page.wait_for_function(READY)
     page.locator("select[name=view]").select_option('"compare"')
     expect(page.locator(".text-measures thead th")).to_have_count(5)
-    expect(page.locator(".text-legend")).to_contain_text("Integral of error, tuned")
+    expect(page.locator(".text-legend")).to_contain_text("B: Tuned")
     search(page)
+    page.locator("summary", has_text="File").click()
     with page.expect_download() as got:
-        press(page, "Save")
-    saved = load(got.value.path())
+        press(page, "Design file of Wang-Young, present")
+    saved = load(got.value.path()).design
     assert (saved.structure, saved.horizon.Np) == ("wang_young", 10)
     press(page, "Receding horizon \u2192")
     page.wait_for_function("window.nmssPlayer?.frames > 0", timeout=60_000)
@@ -524,7 +532,7 @@ def test_a_gain_is_matched(visit: Open) -> None:
     page.locator("input[name=gain]").fill("1, x")
     press(page, "Match")
     expect(page.get_by_role("alert")).to_contain_text("'x' is no number")
-    press(page, "Undo")
+    press(page, "Undo tuning")
     expect(page.locator(".text-weights")).not_to_contain_text("matched")
     expect(page.locator(".wrong")).to_have_count(0)
 

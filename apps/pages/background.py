@@ -3,23 +3,40 @@
 from __future__ import annotations
 
 import logging
+import threading
 from collections.abc import Callable
+from concurrent.futures import CancelledError, Future
 from typing import Any
 
 import panel as pn
 
 from apps.pages.live import FAULT, KEPT
+from apps.work import WAITING, Lent, Withdrawn, processes
 
 LOG = logging.getLogger(__name__)
 
 
-def hand_over(component: Any, name: str, /, **what: Any) -> None:
-    """Have the browser keep a file ("saved"), open an address ("leads") or the like.
+class Work:
+    """Work in a thread that waits for the shared processes; it can be called off."""
 
-    The number tells the same thing asked for twice from the same thing told twice.
-    """
-    number = getattr(component, name).get("number", 0) + 1
-    setattr(component, name, {**what, "number": number})
+    def __init__(self) -> None:
+        self.stop, self.lent = threading.Event(), Lent(processes())
+
+    def call_off(self) -> None:
+        """Have it stop at once: what it has begun is of no use any more."""
+        self.stop.set()
+        self.lent.withdraw()
+
+    def check(self) -> None:
+        """Go on only if nobody has called it off.
+
+        Raises
+        ------
+        Withdrawn
+            If somebody has.
+        """
+        if self.stop.is_set():
+            raise Withdrawn
 
 
 class BackgroundPage:
@@ -36,6 +53,31 @@ class BackgroundPage:
             action()
         elif document.session_context is not None:
             document.add_next_tick_callback(action)
+
+    def _in_thread(
+        self, work: Work, action: Callable[[], None], ended: Callable[[str], None]
+    ) -> Future[None]:
+        """Do something in a thread; how it ended is told on the event loop.
+
+        ``ended`` takes what was wrong: nothing too if the work was called off.
+        """
+
+        def whole() -> None:
+            problem = ""
+            try:
+                work.check()
+                action()
+            except (Withdrawn, CancelledError):
+                pass
+            except ValueError as error:
+                problem = str(error)
+            except Exception:
+                if not work.stop.is_set():  # else the processes ended under it
+                    LOG.exception("%s", type(self).__name__)
+                    problem = FAULT
+            self._later(lambda: ended(problem))
+
+        return WAITING.submit(whole)
 
     def _painted(self, paint: Callable[[], None]) -> None:
         """Draw; figures that are served change on the event loop only."""

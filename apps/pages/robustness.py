@@ -19,7 +19,8 @@ import param
 from bokeh.models import Range1d
 from panel.custom import JSComponent
 
-from apps.pages.background import BackgroundPage, hand_over
+from apps.pages.background import BackgroundPage
+from apps.pages.bar import WithBar
 from apps.pages.live import (
     FAULT,
     WithForm,
@@ -31,7 +32,7 @@ from apps.pages.live import (
     fill,
     page_template,
 )
-from apps.player import STYLE, Controls, script
+from apps.player import STYLE, Controls, hand_over, script
 from apps.robustness import (
     AT_FIRST,
     BY_ITSELF,
@@ -68,7 +69,10 @@ from nmss_lab.uncertainty import Bounds, uncertainty_bounds
 LOG = logging.getLogger(__name__)
 PATH, HEADING = "robustness", "Robustness"
 
-PARTS = "lead", "alert", "told", "panel", "python", "notes", "controls"
+PARTS = (
+    *("bar", "lead", "alert", "told"),
+    *("panel", "python", "notes", "controls"),
+)
 
 TOLD_EVERY = 0.2
 """Seconds between messages while a study grows."""
@@ -81,6 +85,9 @@ WORST = 5
 
 GROWS = 50.0
 """A run this many times as far as the nominal one is cut on another page."""
+
+IN_REPORT = 300
+"""Realisations of a report."""
 
 FACTORS = np.linspace(0.5, 1.5, 101)
 CIRCLE = 0.1
@@ -146,7 +153,7 @@ class Job:
     poles: dict[str, Array]
 
 
-class RobustnessPage(WithForm, BackgroundPage):
+class RobustnessPage(WithForm, WithBar, BackgroundPage):
     """One session's page: keeps the last good study."""
 
     def __init__(self) -> None:
@@ -167,13 +174,13 @@ class RobustnessPage(WithForm, BackgroundPage):
         self.controls = Controls(
             form=self._form(), state=self._state(0), sizing_mode="stretch_width"
         )
-        self.controls.param.watch(self._take, "sent")
         self.panel = StudyPanel(
             progress=self._progress(),
             figures=len(self.figures),
             sizing_mode="stretch_width",
         )
         self.panel.param.watch(self._act, "sent")
+        self._make_bar()
         self._tell()
         if self.document is not None:
             get_ready()
@@ -194,10 +201,12 @@ class RobustnessPage(WithForm, BackgroundPage):
         sent = dict(event.new)
         message, case = sent.pop("message", 0), self.choices.case
         cloud, view = self.choices.cloud, self._view()
+        described = self.choices.description()
         good = self._guard(lambda: self._accept(sent), self.choices.values())
         fresh = self.choices.case != case or sent.get("reset", False)
         if fresh:
             self._forget()
+        if fresh or self.choices.description() != described:
             self.controls.form = self._form()
         if (
             good
@@ -594,6 +603,13 @@ class RobustnessPage(WithForm, BackgroundPage):
             self.panel, "saved", name=f"{what}.csv", text=table.to_csv(index=False)
         )
 
+    def _uncertain(self) -> dict[str, Any]:
+        """Plants that a report tries: those of the study, a few hundred at most."""
+        choices = self.choices
+        many = min(choices.count, IN_REPORT)
+        of_study = {"uncertainty": choices.plants(), "seed": choices.seed}
+        return {**of_study, "realisations": many}
+
     # Words
 
     def _tell(self) -> None:
@@ -609,6 +625,7 @@ class RobustnessPage(WithForm, BackgroundPage):
         view = self._view()
         text = shown.rates_script(view.output, view.peak, done)
         self.python.object = f"<pre>{html.escape(text)}</pre>"
+        self.bar.told = self._loaded()
 
     def _bounds_in_words(self) -> str:
         letter = self.choices.cloud

@@ -20,7 +20,8 @@ from panel.custom import JSComponent
 
 from apps.coupling import Coupling, cells
 from apps.goals import KINDS, MOST_GOALS, Aim, Bench, aims_of, gain_of
-from apps.pages.background import BackgroundPage, hand_over
+from apps.pages.background import BackgroundPage
+from apps.pages.bar import WithBar
 from apps.pages.live import (
     ADDRESS,
     FAULT,
@@ -33,13 +34,13 @@ from apps.pages.live import (
     fill,
     page_template,
 )
-from apps.player import STYLE, Controls, script
-from apps.session import plain
+from apps.player import STYLE, Controls, hand_over, script
+from apps.session import HELD, held, held_as, plain
 from apps.tuning import LOOK, OTHERWISE, TuneChoices
 from apps.weight_tables import weight_table
 from apps.work import WAITING, Lent, ends_with_the_server, get_ready, processes
 from nmss_lab.design import Design
-from nmss_lab.files import dumps
+from nmss_lab.files import Study
 from nmss_lab.matching import Match, match
 from nmss_lab.models import Array
 from nmss_lab.mpc import STRUCTURES
@@ -52,7 +53,7 @@ LOG = logging.getLogger(__name__)
 PATH, HEADING = "tune", "Tune"
 
 PARTS = (
-    *("lead", "alert", "goals", "legend", "grid"),
+    *("bar", "lead", "alert", "goals", "legend", "grid"),
     *("weights", "measures", "python", "controls"),
 )
 
@@ -79,7 +80,6 @@ class Goals(JSComponent):
     typed = param.Dict(default={})
     figures = param.Integer(default=0)
     sent = param.Dict(default={})
-    saved = param.Dict(default={})
     leads = param.Dict(default={})
 
     _esm = script("goals.js")
@@ -106,7 +106,7 @@ class Live(NamedTuple):
     values: Mapping[str, float]
 
 
-class TunePage(WithForm, BackgroundPage):
+class TunePage(WithForm, WithBar, BackgroundPage):
     """One session's page: keeps the last design and picture that worked."""
 
     def __init__(self) -> None:
@@ -119,7 +119,6 @@ class TunePage(WithForm, BackgroundPage):
         self.work: Future[None] | None = None
         self.lent: Lent | None = None
         self.began = self.lasted = 0.0
-        self.kept: dict[str, tuple[str, Design]] = {}
         self.past: list[Place] = []
         self.live: Live | None = None
         self.history: list[tuple[int, float]] = []
@@ -150,8 +149,8 @@ class TunePage(WithForm, BackgroundPage):
         self.controls = Controls(
             form=self._form(), state=self._state(0), sizing_mode="stretch_width"
         )
-        self.controls.param.watch(self._take, "sent")
         self.goals.param.watch(self._act, "sent")
+        self._make_bar()
         self._tell()
         if self.document is not None:
             ends_with_the_server(self, self.document)
@@ -191,6 +190,7 @@ class TunePage(WithForm, BackgroundPage):
         """What the plots depend on."""
         choices = self.choices
         shown = choices.view, choices.stepped, choices.output, choices.input
+        shown = *shown, choices.A, choices.B
         return (*shown, self.made_for, self.tried_for)
 
     def _changed(self, sent: dict[str, Any]) -> None:
@@ -218,8 +218,6 @@ class TunePage(WithForm, BackgroundPage):
             start, bench = choices.start(), choices.bench()
             choices.aims(bench)
             bench.runs(start)
-            if self.made_for and made_for[0] != self.made_for[0]:
-                self.kept.clear()
             self.call_off()
             self.stop, self.work, self.live = threading.Event(), None, None
             self.past.clear()
@@ -251,10 +249,8 @@ class TunePage(WithForm, BackgroundPage):
             "tune": self._begin,
             "undo": self._undo,
             "continue": self._go_on,
-            "keep": lambda: self._keep(str(sent.get("which"))),
             "loop": lambda: self._send("receding_horizon"),
             "robust": lambda: self._send("robustness"),
-            "save": self._save,
             "match": lambda: self._match(str(sent.get("text", ""))),
             "gain": self._type_gain,
         }
@@ -344,14 +340,34 @@ class TunePage(WithForm, BackgroundPage):
     def _remember(self) -> None:
         self.past = [*self.past[-19:], self.place]
 
-    def _keep(self, which: str) -> None:
-        if which not in ("A", "B"):
-            raise ValueError(f"design {which!r}: expected A or B")
-        word = "tuned" if self.place.after is not None else "before tuning"
-        if self.place.after is not None and self.place.gain is not None:
-            word = "matched to a gain"
-        label = f"{plain(self.choices.structure)}, {word}"
-        self.kept[which] = label, self.present
+    # What the bar has of this page
+
+    def _shown_designs(self) -> list[str]:
+        return list(self._designs())
+
+    def _design_named(self, name: str) -> str:
+        named = name in HELD
+        return f"design {name}" if named else f"{plain(self.choices.structure)}, {name}"
+
+    def _address(self, name: str) -> str:
+        chosen = self._designs()[name]
+        name = "before" if chosen is self.place.before else "tuned"
+        kept = self.choices.keep(chosen, self.place.before)
+        return held_as("case", kept, name)
+
+    def _without(self, which: str) -> dict[str, Any]:
+        return {which: ""}
+
+    def _side_by_side(self) -> dict[str, Any]:
+        return {"view": "compare"}
+
+    def _study(self, name: str) -> Study:
+        trial = self.bench.trials[self._trial]
+        plant = self.choices.example.plant
+        return Study(self._designs()[name], plant, trial.scenario)
+
+    def _run_of(self, name: str) -> Run:
+        return self._runs()[0][name]
 
     def _send(self, page: str) -> None:
         """Open another page with the design."""
@@ -367,9 +383,6 @@ class TunePage(WithForm, BackgroundPage):
             horizon = tuned.horizon
             more = f"&structures=tuned,before&Np={horizon.Np}&Nc={horizon.Nc}"
         hand_over(self.goals, "leads", to=f"{page}?case={name}{more}")
-
-    def _save(self) -> None:
-        hand_over(self.goals, "saved", name="design.json", text=dumps(self.present))
 
     def _found(self) -> Design:
         if self.place.after is None:
@@ -395,7 +408,7 @@ class TunePage(WithForm, BackgroundPage):
         self.history, self.tried = [], 0
         lent = self.lent
         self.work = WAITING.submit(
-            self._in_thread, stop, lambda: self._search(stop, job, keys, bench, lent)
+            self._beside, stop, lambda: self._search(stop, job, keys, bench, lent)
         )
 
     def _start(self) -> threading.Event:
@@ -411,7 +424,7 @@ class TunePage(WithForm, BackgroundPage):
         if self.lent is not None:
             self.lent.withdraw()
 
-    def _in_thread(self, stop: threading.Event, work: Callable[[], None]) -> None:
+    def _beside(self, stop: threading.Event, work: Callable[[], None]) -> None:
         """Do the work of a thread that waits; say on the event loop what went wrong."""
         try:
             if not stop.is_set():
@@ -565,7 +578,7 @@ class TunePage(WithForm, BackgroundPage):
             )
             self._later(lambda: self._has_matched(stop, found, K))
 
-        self.work = WAITING.submit(self._in_thread, stop, work)
+        self.work = WAITING.submit(self._beside, stop, work)
 
     def _has_matched(self, stop: threading.Event, found: Match, K: Array) -> None:
         if stop is not self.stop:
@@ -600,7 +613,7 @@ class TunePage(WithForm, BackgroundPage):
         return float(found)
 
     def _in_use(self) -> list[Design]:
-        own = [self.place.before, self.place.after, *(d for _, d in self.kept.values())]
+        own = [self.place.before, self.place.after, *self.choices.fitting().values()]
         own.append(self.live.design if self.live else None)
         return [design for design in own if design is not None]
 
@@ -614,8 +627,7 @@ class TunePage(WithForm, BackgroundPage):
         """Designs that are shown side by side."""
         present = self.live.design if self.live else self.present
         if self.choices.view == "compare":
-            kept = {which: self.kept[which][1] for which in sorted(self.kept)}
-            return {**kept, "present": present}
+            return {**self.choices.fitting(), "present": present}
         if present is self.place.before:
             return {"before": present}
         return {"before": self.place.before, self._word: present}
@@ -674,7 +686,9 @@ class TunePage(WithForm, BackgroundPage):
         return f'<p class="small">{what}{marks}{line}.{counted}{gone}</p>'
 
     def _long(self, name: str) -> str:
-        return f"{name}: {self.kept[name][0]}" if name in self.kept else name
+        if name not in HELD:
+            return name
+        return f"{name}: {held(getattr(self.choices, name)).words}"
 
     def _cells(self) -> dict[str, Any]:
         trials = self.bench.trials
@@ -708,6 +722,7 @@ class TunePage(WithForm, BackgroundPage):
         aims = self._aims()
         text = choices.script_of(self.place.before, aims, self.place.gain)
         self.python.object = f"<pre>{html.escape(text)}</pre>"
+        self.bar.told = self._loaded()
         if not self.served:
             self.grid.grid = self._cells()
             self.legend.object = self._legend()
@@ -789,7 +804,6 @@ class TunePage(WithForm, BackgroundPage):
             "values": values,
             "undo": bool(self.past),
             "tuned": self.place.after is not None,
-            "kept": {which: label for which, (label, _) in self.kept.items()},
             "gain": K is not None,
             "shape": shape,
             "match": self.matched,
