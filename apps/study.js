@@ -106,20 +106,6 @@ export function render({ model, el }) {
     fillWorst()
   }
 
-  // Circles are round: the longer side of the frame shows more of the plane
-  const round = () => {
-    const view = figureViews().poles
-    const { width, height } = view.frame.bbox
-    if (!(width > 0 && height > 0)) return
-    const { x_range: x, y_range: y } = view.model
-    const [wide, tall] = [Math.max(1, width / height), Math.max(1, height / width)]
-    quietly(x, { start: -x.reset_end * wide, end: x.reset_end * wide })
-    quietly(y, { start: -x.reset_end * tall, end: x.reset_end * tall })
-  }
-  const soon = () => setTimeout(round, 50)
-  window.addEventListener("resize", soon)
-  model.on("remove", () => window.removeEventListener("resize", soon))
-
   model.on("rates", fillRates)
   model.on("worst", fillWorst)
   model.on("picked", fillPicked)
@@ -129,11 +115,7 @@ export function render({ model, el }) {
   fillPicked()
   progress()
   followTheme(model, () => model.figures, () => {
-    if (!window.nmssStudy) {
-      const plot = figureViews().poles.model
-      plot.x_range.properties.reset_end.change.connect(soon)
-      soon()
-    }
+    if (!window.nmssStudy) keepRound(model)
     window.nmssStudy = Object.assign(statistics, {
       running: () => model.progress.running,
       shown: () => model.progress.done,
