@@ -49,7 +49,15 @@ def tune(page: Page, url: str) -> None:
     page.wait_for_function("window.nmssTune?.finished === 1", timeout=120_000)
 
 
-STUDIES = {"robustness": robustness, "tune": tune}
+def workbench(page: Page, url: str) -> None:
+    """Go from the record that the page begins with to the report."""
+    page.goto(f"{url}workbench")
+    page.wait_for_function("window.nmssWorkbench?.states()[1] === 'done'")
+    page.get_by_role("button", name="Do all").click()
+    page.wait_for_function("nmssWorkbench.states()[6] === 'done'", timeout=120_000)
+
+
+STUDIES = {"robustness": robustness, "tune": tune, "workbench": workbench}
 """Pages whose picture is that of finished work."""
 
 

@@ -20,7 +20,8 @@ from bokeh.models import BoxAnnotation, Range1d
 from panel.custom import JSComponent
 
 from apps.identification import LARGEST, LOOK, RECORDS, IdentifyChoices, uploaded
-from apps.pages.background import BackgroundPage, hand_over
+from apps.pages.background import BackgroundPage
+from apps.pages.bar import WithBar
 from apps.pages.live import (
     ADDRESS,
     FAULT,
@@ -32,8 +33,9 @@ from apps.pages.live import (
     fill,
     page_template,
 )
-from apps.player import STYLE, Controls, script
-from apps.session import keep_model
+from apps.player import STYLE, Controls, hand_over, script
+from apps.session import held_as, keep_model
+from apps.work import ends_with_the_server
 from nmss_lab.files import dumps
 from nmss_lab.identify import Candidate, Estimate
 from nmss_lab.plots import Chart, EstimateFigure, estimate_charts, record_charts
@@ -41,7 +43,10 @@ from nmss_lab.plots import Chart, EstimateFigure, estimate_charts, record_charts
 LOG = logging.getLogger(__name__)
 PATH, HEADING = "identify", "Identify"
 
-PARTS = "lead", "alert", "ranking", "measures", "python", "upload", "controls"
+PARTS = (
+    *("bar", "lead", "alert", "ranking"),
+    *("measures", "python", "upload", "controls"),
+)
 
 WORKERS = ThreadPoolExecutor(max_workers=2, thread_name_prefix="search")
 """Searches of all sessions; more of them wait."""
@@ -83,7 +88,33 @@ class Ranking(JSComponent):
     _stylesheets = (STYLE,)
 
 
-class IdentifyPage(BackgroundPage):
+class WithRecord:
+    """A page whose choices begin with a record, shipped or uploaded."""
+
+    choices: Any
+
+    def _accept(self, sent: dict[str, Any]) -> None:
+        """Take over what the form sent: all anew, another record, or choices."""
+        if sent.pop("whole", False):
+            self.choices.accept(sent)
+        elif sent.pop("reset", False):
+            self.choices.take_record("gas_furnace")
+        elif sent.get("record") != self.choices.record:
+            self.choices.accept({"record": sent.get("record")})
+        else:
+            self.choices.accept(sent)
+
+    def _open(self, sent: Mapping[str, Any]) -> None:
+        """Take over an uploaded file."""
+        try:
+            data = base64.b64decode(str(sent["data"]), validate=True)
+        except binascii.Error as error:
+            raise ValueError("the file did not arrive whole: try again") from error
+        size = max(int(sent["size"]), len(data))
+        self.choices.take_file(uploaded(str(sent["name"]), data, size))
+
+
+class IdentifyPage(WithRecord, WithBar, BackgroundPage):
     """One session's page: keeps the last good record and ranking."""
 
     def __init__(self) -> None:
@@ -112,17 +143,22 @@ class IdentifyPage(BackgroundPage):
         self.controls = Controls(
             form=self._form(), state=self._state(0), sizing_mode="stretch_width"
         )
-        self.controls.param.watch(self._take, "sent")
         self.ranking = Ranking(
             progress=self._progress(0),
             figures=len(self.figures),
             sizing_mode="stretch_width",
         )
         self.ranking.param.watch(self._act, "sent")
+        self._make_bar()
         self._tell()
         self._show()
         if self.document is not None:
+            ends_with_the_server(self, self.document)
             pn.state.onload(self._begin)
+
+    def call_off(self) -> None:
+        """Have the search stop after the fit that is being made."""
+        self.stop.set()
 
     # From the form and the plot
 
@@ -158,14 +194,6 @@ class IdentifyPage(BackgroundPage):
         """All choices: what a ranking was asked for with."""
         return tuple(repr(value) for value in self.choices.values().values())
 
-    def _accept(self, sent: dict[str, Any]) -> None:
-        if sent.pop("reset", False):
-            self.choices.take_record("gas_furnace")
-        elif sent.get("record") != self.choices.record:
-            self.choices.accept({"record": sent.get("record")})
-        else:
-            self.choices.accept(sent)
-
     def _take_file(self, event: Any) -> None:
         """Take over an uploaded file, or say what is wrong with it."""
         sent = dict(event.new)
@@ -179,14 +207,6 @@ class IdentifyPage(BackgroundPage):
         self.controls.form = self._form()
         self.controls.state = self._state(0)
         self.upload.answered += 1
-
-    def _open(self, sent: dict[str, Any]) -> None:
-        try:
-            data = base64.b64decode(str(sent["data"]), validate=True)
-        except binascii.Error as error:
-            raise ValueError("the file did not arrive whole: try again") from error
-        size = max(int(sent["size"]), len(data))
-        self.choices.take_file(uploaded(str(sent["name"]), data, size))
 
     def _dragged(self, name: str) -> Callable[[str, Any, Any], None]:
         """Return what takes over the span of a box that was moved."""
@@ -215,7 +235,7 @@ class IdentifyPage(BackgroundPage):
         if act == "search":
             self._begin()
         elif act == "cancel":
-            self.stop.set()
+            self.call_off()
         elif act == "choose":
             self._choose(sent.get("chosen", []))
         elif act in ("control", "govern", "save"):
@@ -224,7 +244,7 @@ class IdentifyPage(BackgroundPage):
 
     def _begin(self) -> None:
         """Start a search off the event loop; an older one is called off."""
-        self.stop.set()
+        self.call_off()
         self.stop = stop = threading.Event()
         self.hint = ""
         try:
@@ -324,7 +344,7 @@ class IdentifyPage(BackgroundPage):
 
     def _forget(self) -> None:
         """Drop the ranking of another record."""
-        self.stop.set()
+        self.call_off()
         self.stop = threading.Event()
         self.search, self.note = None, ""
         self.found, self.chosen = [], []
@@ -386,6 +406,31 @@ class IdentifyPage(BackgroundPage):
         self.alert.object = _complaint(self.complaint)
         orders = next(iter(self.compared), "")
         self.python.object = f"<pre>{html.escape(choices.script(orders))}</pre>"
+        self.bar.told = self._loaded()
+
+    # What the bar has of this page: models, and the design that each begins with
+
+    def _subject(self) -> str:
+        return RECORDS[self.choices.record]
+
+    def _shown_designs(self) -> list[str]:
+        return list(self.compared)
+
+    def _design_named(self, name: str) -> str:
+        return f"model {name}"
+
+    def _files(self) -> Mapping[str, str]:
+        return {"save": "File of {}"}
+
+    def _address(self, name: str) -> str:
+        return held_as("case", keep_model(self.compared[name]), "wang_young")
+
+    def _without(self, which: str) -> dict[str, Any]:
+        return {which: ""}
+
+    def _save_design(self, name: str) -> None:
+        text = dumps(self.compared[name])
+        hand_over(self.bar, "saved", name="model.json", text=text)
 
     def _progress(self, done: int) -> dict[str, Any]:
         running = self.search is not None
@@ -504,7 +549,7 @@ def page() -> pn.Template:
     """Build the page for a new session."""
     made = IdentifyPage()
     if pn.state.curdoc is not None:
-        pn.state.on_session_destroyed(lambda _: made.stop.set())
+        pn.state.on_session_destroyed(lambda _: made.call_off())
     return made.template()
 
 
