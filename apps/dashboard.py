@@ -8,12 +8,15 @@ import panel as pn
 from panel.viewable import Viewable
 
 from apps.pages import (
+    disturbances,
     governor,
     identify,
     receding_horizon,
     robustness,
     state_dependent,
+    structures,
     tune,
+    workbench,
 )
 from apps.pages.live import Subject, page_template, text_style
 from apps.session import known_case
@@ -26,12 +29,21 @@ INDEX = """
 <p>Every plot answers while you move a slider, and every run can be played: see the
 controller plan, act, and plan again.</p>
 <div class="cards">
+<a class="card" href="workbench"><b>Workbench</b>
+From a record of your plant to a verified design in seven steps, each with its state,
+its numbers and its picture, and a report at the end.</a>
 <a class="card" href="receding_horizon"><b>Receding horizon</b>
 Up to three control structures side by side on the worked examples, with limits,
 disturbances, and a plant that differs from its model.</a>
+<a class="card" href="structures"><b>Structures</b>
+All structures on one plant, one disturbance, one sheet of scores: hidden modes, poles,
+sensitivities, and how each follows and recovers.</a>
 <a class="card" href="governor"><b>Reference governor</b>
 One loop with and without a governor that bends the reference just enough to keep
 every limit.</a>
+<a class="card" href="disturbances"><b>Disturbances</b>
+A disturbance that is measured, and the same controller without the measurement: on one
+loop, and in a building whose zones take colour as it plays.</a>
 <a class="card" href="identify"><b>Identify</b>
 From a record, shipped or your own, to a ranked table of models with honest
 uncertainty, and from there to a controller.</a>
@@ -52,7 +64,12 @@ bands and rates, how often and how badly, and each one to look into.</a>
 def index() -> pn.Template:
     """Build the page that leads to the others."""
     page = page_template("", "Predictive control in the non-minimal state space")
-    subjects = (receding_horizon.SUBJECT, governor.SUBJECT, state_dependent.SUBJECT)
+    subjects = (
+        receding_horizon.SUBJECT,
+        governor.SUBJECT,
+        disturbances.SUBJECT,
+        state_dependent.SUBJECT,
+    )
     lists = "".join(_examples(subject) for subject in subjects)
     text = pn.pane.HTML(
         INDEX + lists, stylesheets=[text_style()], sizing_mode="stretch_width"
@@ -84,10 +101,13 @@ def pages() -> dict[str, Callable[[], Viewable]]:
     logging.getLogger("nmss_lab").setLevel(logging.ERROR)
     return {
         "": index,
+        "workbench": workbench.page,
         "receding_horizon": receding_horizon.page,
         "governor": governor.page,
+        "disturbances": disturbances.page,
         "identify": identify.page,
         "tune": tune.page,
         "state_dependent": state_dependent.page,
         "robustness": robustness.page,
+        "structures": structures.page,
     }

@@ -4,6 +4,7 @@ import signal
 import socket
 import subprocess
 import sys
+import urllib.error
 import urllib.request
 from html.parser import HTMLParser
 from pathlib import Path
@@ -13,6 +14,7 @@ import pytest
 from conftest import Server
 from playwright.sync_api import Page
 
+from apps.lessons import lessons
 from apps.pages.live import PAGES
 
 PATHS = ["", *(path for path, _ in PAGES)]
@@ -155,3 +157,25 @@ def test_occupied_port_is_explained() -> None:
     assert done.returncode == 1
     assert f"port {port}" in done.stderr
     assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("path", PATHS[1:])
+def test_each_page_leads_to_its_lesson(server: Server, path: str) -> None:
+    """The link is there, and answers: with the lesson, or with how to write it."""
+    page = get(server.url + path).decode()
+    found = lessons(path)
+    assert found
+    for address, title in found:
+        assert f'<a href="{address}">{title}</a>' in page
+        answer = get(urljoin(server.url, address)).decode()
+        assert title in answer
+        assert "make lessons" in answer or "MathJax" in answer or "bokeh" in answer
+
+
+@pytest.mark.parametrize(
+    "address", ["lessons/none.html", "lessons/..%2f..%2fREADME.md", "lessons/%2e%2e/x"]
+)
+def test_lessons_are_all_that_is_read(server: Server, address: str) -> None:
+    """No other file of the checkout can be had by that way."""
+    with pytest.raises(urllib.error.HTTPError):
+        get(urljoin(server.url, address))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import html
 import logging
 import math
@@ -13,10 +14,14 @@ from typing import Any
 
 import jinja2
 import panel as pn
+from bokeh.document import Document
 from bokeh.models import Range1d
 
+from apps.lessons import lessons
+from apps.microscope import Microscope, magnified
+from apps.pages.bar import FAULT, WithBar
 from apps.player import INSIDE, Controls, Player, moving, stepping
-from apps.session import Choices, plain
+from apps.session import HELD, Choices, plain
 from nmss_lab.measures import table
 from nmss_lab.plots import Chart, ChartFigure, busiest_sample, time_unit
 from nmss_lab.simulate import Run
@@ -24,18 +29,23 @@ from nmss_lab.simulate import Run
 LOG = logging.getLogger(__name__)
 HERE = Path(__file__).resolve().parent.parent
 PAGES = (
+    ("workbench", "Workbench"),
     ("receding_horizon", "Receding horizon"),
+    ("structures", "Structures"),
     ("governor", "Reference governor"),
+    ("disturbances", "Disturbances"),
     ("identify", "Identify"),
     ("tune", "Tune"),
     ("state_dependent", "State-dependent"),
     ("robustness", "Robustness"),
 )
 
-PARTS = "lead", "alert", "player", "measures", "python", "notes", "controls"
+PARTS = (
+    *("bar", "lead", "alert", "player", "microscope"),
+    *("measures", "python", "notes", "controls"),
+)
 
 ADDRESS = "In the address of this page: "
-FAULT = "These choices met a fault in the program; it has been logged."
 KEPT = "The picture still shows the last choices that worked."
 
 COLUMNS = {
@@ -48,6 +58,14 @@ COLUMNS = {
     "violations": "Limits broken",
 }
 IN_TIME = "rise", "settling"
+
+
+CARRIED = (
+    *("case", "structures", "Np", "Nc", "weight_y", "weight_move"),
+    *("limit_u", "u_max", "limit_du", "du_max", "limit_y", "y_max"),
+    *("gain", "dynamics", "step_u", "step_y", "step_at", *HELD),
+)
+"""Choices that go along when somebody changes pages."""
 
 
 @dataclass(frozen=True)
@@ -94,7 +112,9 @@ class WithForm:
 
     def _accept(self, sent: Mapping[str, Any]) -> None:
         """Take over what the form sent: all anew, another case, or choices."""
-        if sent.get("reset", False):
+        if sent.get("whole", False):
+            self.choices.accept(sent)
+        elif sent.get("reset", False):
             self.choices.take_case(self.choices.default_case)
         elif sent.get("case") != self.choices.case:
             self.choices.accept({"case": sent.get("case")})
@@ -102,7 +122,7 @@ class WithForm:
             self.choices.accept(sent)
 
 
-class LivePage(WithForm):
+class LivePage(WithForm, WithBar):
     """One session's page: keeps the last good picture whatever is chosen."""
 
     def __init__(self, subject: Subject) -> None:
@@ -115,16 +135,17 @@ class LivePage(WithForm):
         self.runs, charts = self._first_picture()
         times = Range1d(*charts[0].span)
         self.figures = {chart.name: ChartFigure(chart, times) for chart in charts}
-        start = busiest_sample(self.runs)
         self.player = Player(
-            run=moving(charts, self._named(), start, True), sizing_mode="stretch_width"
+            run=moving(charts, self._named(), self._start(), True),
+            sizing_mode="stretch_width",
         )
+        self.microscope = Microscope(sizing_mode="stretch_width")
         self.within: dict[str, ChartFigure] = {}
         self.inside = self._first_inside()
         self.controls = Controls(
             form=self._form(), state=self._state(0), sizing_mode="stretch_width"
         )
-        self.controls.param.watch(self._take, "sent")
+        self._make_bar()
         self._tell()
         self._measure()
 
@@ -161,6 +182,10 @@ class LivePage(WithForm):
         shown = self.choices.output, self.choices.input
         return runs, self.subject.charts(named, *shown)
 
+    def _start(self) -> int:
+        """Sample at which the player begins."""
+        return busiest_sample(self.runs)
+
     def _named(self) -> dict[str, Run]:
         return {plain(name): run for name, run in self.runs.items()}
 
@@ -168,6 +193,7 @@ class LivePage(WithForm):
         """Take over what the form sent, compute, show, and answer."""
         sent = dict(event.new)
         message, case = sent.pop("message", 0), self.choices.case
+        described = self.choices.description()
         try:
             self._accept(sent)
             self.runs, charts = self._compute()
@@ -179,10 +205,11 @@ class LivePage(WithForm):
             LOG.exception("choices %s", self.choices.values())
             self.complaint, charts = f"{FAULT}\n{KEPT}", []
         fresh = self.choices.case != case
+        anew = fresh or self.choices.description() != described
         if charts:
-            start = busiest_sample(self.runs)
-            self.player.run = moving(charts, self._named(), start, fresh)
-        if fresh:
+            named, start = self._named(), self._start()
+            self.player.run = moving(charts, named, start, fresh)
+        if anew:
             self.controls.form = self._form()
         self._tell()
         if charts:
@@ -195,11 +222,14 @@ class LivePage(WithForm):
         self.lead.object = _paragraph(look.get(example.name, example.title + "."))
         self.alert.object = _complaint(self.complaint)
         notes = "".join(f"<li>{html.escape(note)}</li>" for note in example.notes)
-        source = html.escape(f"Section {example.section}. {example.source}.")
+        section = f"Section {example.section}. " if example.section else ""
+        source = html.escape(f"{section}{example.source}.")
         self.notes.object = f"<p>{source}</p><ul>{notes}</ul>"
+        self.bar.told = self._loaded()
 
     def _measure(self) -> None:
-        """Show table and Python of the runs."""
+        """Show prices, table and Python of the runs."""
+        self.microscope.seen = magnified(self._named(), self.choices.input)
         self.measures.object = _measures(self._named(), self.choices.output)
         self.python.object = f"<pre>{html.escape(self.choices.script())}</pre>"
 
@@ -219,14 +249,29 @@ def live_page(subject: Subject) -> pn.Template:
     return LivePage(subject).template()
 
 
+class Frame(pn.Template):
+    """A page whose document is gone through once, when all of it is there."""
+
+    def server_doc(
+        self, doc: Document | None = None, *args: Any, **more: Any
+    ) -> Document:
+        """Put all parts into the document of a session."""
+        document = pn.state.curdoc if doc is None else doc
+        with document.models.freeze():
+            return super().server_doc(document, *args, **more)
+
+
 def page_template(path: str, heading: str, charts: Sequence[str] = ()) -> pn.Template:
     """Build the frame of a page; panels are added by name."""
-    page = pn.Template(_page_source())
+    page = Frame(_page_source())
     page.title = f"{heading} - NMSS Lab"
     page.add_variable("page_style", (HERE / "page.css").read_text(encoding="utf-8"))
     page.add_variable("pages", PAGES)
     page.add_variable("here", path)
+    page.add_variable("carried", CARRIED)
+    page.add_variable("user", pn.state.user)
     page.add_variable("heading", heading)
+    page.add_variable("lessons", lessons(path))
     page.add_variable("charts", list(charts))
     return page
 
@@ -269,13 +314,23 @@ def _text(name: str) -> pn.pane.HTML:
 
 
 def _from_address(choices: Choices) -> str:
-    """Take the choices in the page's address; return what is wrong with them."""
+    """Take the choices in the page's address; return what is wrong with them.
+
+    Somebody who comes "via" another page brings choices along: those that this page
+    does not have are left behind without a word.
+    """
     arguments = pn.state.session_args or {}
     given = {key: values[0].decode() for key, values in arguments.items()}
+    came = given.pop("via", "")
     try:
         choices.accept(given)
     except ValueError as error:
-        return f"{ADDRESS}{error}"
+        if not came:
+            return f"{ADDRESS}{error}"
+        if given.get("case", choices.case) != choices.case:
+            with contextlib.suppress(ValueError):
+                choices.put({key: given[key] for key in HELD if key in given})
+            return f"This page shows an example of its own: {error}"
     return ""
 
 
