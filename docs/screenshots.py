@@ -19,6 +19,7 @@ VIEWS = {
     "receding_horizon": ("?gain=20", 22, True),
     "governor": ("", 34, False),
     "state_dependent": ("?structures=frozen,iterated", 9, True),
+    "disturbances": ("?case=measured_disturbance_7_4_1", 55, False),
 }
 """Page: choices in its address, sample shown, whether past plans are drawn."""
 
@@ -57,8 +58,34 @@ def workbench(page: Page, url: str) -> None:
     page.wait_for_function("nmssWorkbench.states()[6] === 'done'", timeout=120_000)
 
 
-STUDIES = {"robustness": robustness, "tune": tune, "workbench": workbench}
-"""Pages whose picture is that of finished work."""
+def floor_plan(page: Page, url: str) -> None:
+    """Open the temperature installation while its door is open."""
+    page.goto(f"{url}disturbances?case=temperature_7_4_2")
+    page.wait_for_function("window.nmssPlayer?.frames > 0")
+    page.locator(".floorplan").scroll_into_view_if_needed()
+
+
+def structures(page: Page, url: str) -> None:
+    """Open the sheet that the page begins with."""
+    page.goto(f"{url}structures")
+    page.wait_for_function("window.nmssSheet?.rows() > 0")
+
+
+def identify(page: Page, url: str) -> None:
+    """Open the record that the page begins with, and wait for its search."""
+    page.goto(f"{url}identify")
+    page.locator("td").first.wait_for(timeout=60_000)
+
+
+STUDIES = {
+    "robustness": robustness,
+    "tune": tune,
+    "workbench": workbench,
+    "structures": structures,
+    "identify": identify,
+    "floor_plan": floor_plan,
+}
+"""Pictures that show finished work, or no player's sample."""
 
 
 def take(page: Page, url: str, name: str) -> None:

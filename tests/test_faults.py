@@ -193,7 +193,7 @@ async def busy(server: Server, at_least: float = 0.5) -> None:
     raise AssertionError("nothing is computed")
 
 
-LONG_STUDY = "robustness?case=ifac93_6_3_3&uncertainty=gains&count=10000"
+LONG_STUDY = "robustness?case=ifac93_6_3_3&uncertainty=gains&n=10000"
 LONG_SEARCH = "tune?most=6000&starts=10"
 
 
@@ -203,7 +203,7 @@ def test_a_study_outlives_a_killed_worker(server: Server) -> None:
 
     async def visit() -> None:
         visitor = await Visitor.open(
-            server.url, "robustness?case=ifac93_6_3_3&uncertainty=gains&count=1500"
+            server.url, "robustness?case=ifac93_6_3_3&uncertainty=gains&n=1500"
         )
         await visitor.put("StudyPanel", "sent", {"act": "run", "message": 1})
         await visitor.until(lambda: visitor.value("StudyPanel", "progress")["running"])
@@ -265,7 +265,7 @@ def test_work_ends_with_its_page(
         await visitor.close()
 
     async def come(server: Server) -> None:
-        visitor = await Visitor.open(server.url, "robustness?count=40")
+        visitor = await Visitor.open(server.url, "robustness?uncertainty=ranges&n=40")
         progress = "StudyPanel", "progress"
         await visitor.until(lambda: visitor.value(*progress)["done"] == 40)
         await visitor.close()
