@@ -126,7 +126,7 @@ export function render({ model, el }) {
     note.textContent = "The link is copied."
     setTimeout(() => { note.textContent = "" }, 2500)
   }
-  const note = element("span", { class: "note", role: "status" })
+  const note = element("span", { class: "said", role: "status" })
 
   const bar = element("div", { class: "designs", role: "group", "aria-label": "Design" },
     loaded, undo, redo, slots.A[0], slots.B[0], compare, file, note)

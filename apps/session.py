@@ -177,7 +177,8 @@ class Form(param.Parameterized):
         """
         wrong = ""
         # what is held first: it is among what the others choose from
-        for key in sorted(set(values) & set(self.names()), key=self.names().index):
+        given = [key for key in values if key in self.names()]
+        for key in sorted(given, key=lambda key: key not in HELD):
             try:
                 setattr(self, key, self._read(key, values[key]))
             except (ValueError, TypeError) as error:
