@@ -181,10 +181,15 @@ def _run(server: Any, arguments: argparse.Namespace, shared: _Shared | None) -> 
     loop = server.io_loop
     # get_server has already taken care of Ctrl-C in the same way.
     signal.signal(signal.SIGTERM, lambda *_: loop.add_callback_from_signal(loop.stop))
-    speaks = shared is None
+    speaks, left = shared is None, []
+
+    def leave(*_: Any) -> None:
+        left.append(True)  # the first process ends, or was killed
+        loop.stop()
+
     if shared is not None:
         os.close(shared.held)
-        loop.add_handler(shared.watch, lambda *_: loop.stop(), loop.READ)
+        loop.add_handler(shared.watch, leave, loop.READ)
         speaks = importlib.import_module("tornado.process").task_id() == 0
     server.start()
     if speaks:
@@ -196,7 +201,7 @@ def _run(server: Any, arguments: argparse.Namespace, shared: _Shared | None) -> 
     server.stop()
     if shared is None:
         print("NMSS Lab has stopped", flush=True)
-    elif os.getppid() != shared.first:  # which was killed
+    elif left:
         shutil.rmtree(shared.folder, ignore_errors=True)
 
 
