@@ -15,10 +15,7 @@ const places = () => {
 
 const asSVG = () => {
   const { width, height, each } = places()
-  const picture = document.createElementNS("http://www.w3.org/2000/svg", "svg")
-  for (const [name, value] of Object.entries({ width, height })) {
-    picture.setAttribute(name, value)
-  }
+  const picture = drawing("svg", { width, height })
   picture.setAttribute("xmlns", "http://www.w3.org/2000/svg")
   picture.style.background = colorsNow().paper
   for (const [view, x, y] of each) {
@@ -64,9 +61,9 @@ export function render({ model, el }) {
     made.addEventListener("click", action)
     return made
   }
-  const icon = (path, label, action) => {
+  const pictured = (path, label, action) => {
     const made = button("", action, { "aria-label": label, title: label, class: "icon" })
-    made.innerHTML = `<svg viewBox="0 0 24 24" aria-hidden="true"><path d="${path}"/></svg>`
+    made.append(icon(path))
     return made
   }
   // A menu that closes when something is chosen, with Escape, and when it is left
@@ -95,8 +92,8 @@ export function render({ model, el }) {
   document.addEventListener("pointerdown", away)
 
   const asks = (name) => () => window.dispatchEvent(new Event(`nmss-${name}`))
-  const undo = icon("M9 7H15a5 5 0 0 1 0 10H8M9 3 5 7l4 4", "Undo (Ctrl+Z)", asks("undo"))
-  const redo = icon("M15 7H9a5 5 0 0 0 0 10h7M15 3l4 4-4 4", "Redo (Ctrl+Shift+Z)", asks("redo"))
+  const undo = pictured("M9 7H15a5 5 0 0 1 0 10H8M9 3 5 7l4 4", "Undo (Ctrl+Z)", asks("undo"))
+  const redo = pictured("M15 7H9a5 5 0 0 0 0 10h7M15 3l4 4-4 4", "Redo (Ctrl+Shift+Z)", asks("redo"))
   const history = (event) => {
     undo.disabled = !event.detail.undo
     redo.disabled = !event.detail.redo

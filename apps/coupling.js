@@ -1,15 +1,7 @@
 // Which reference moves which output: small plots in a grid, one row a reference that
 // steps, one column an output, several designs in each cell.
 
-const NAMESPACE = "http://www.w3.org/2000/svg"
 const WIDTH = 220, HEIGHT = 110, LEFT = 44, BOTTOM = 20, TOP = 6, RIGHT = 6
-
-const drawing = (tag, attributes, ...children) => {
-  const node = document.createElementNS(NAMESPACE, tag)
-  for (const [name, value] of Object.entries(attributes)) node.setAttribute(name, value)
-  node.append(...children)
-  return node
-}
 
 const tick = (value) => Number(value.toPrecision(3)).toString().replace("-", "\u2212")
 

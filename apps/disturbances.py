@@ -17,6 +17,7 @@ from apps.session import (
     _largest,
     _round_number,
     known_case,
+    literal,
     plain,
 )
 from nmss_lab.cases import LINEAR_CASES, Case
@@ -231,7 +232,7 @@ class DisturbanceChoices(LoopChoices):
         return wave
 
     def _scenario_lines(self) -> list[str]:
-        lines, level = super()._scenario_lines(), f"np.array({self._level.tolist()})"
+        lines, level = super()._scenario_lines(), literal(self._level)
         if self.shape != "case":
             profile = SHAPES[self.shape].format(length=self.length)
             return [

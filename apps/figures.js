@@ -7,6 +7,17 @@ const element = (tag, attributes = {}, ...children) => {
   return node
 }
 
+// The same in a picture, which is SVG.
+const drawing = (tag, attributes = {}, ...children) => {
+  const node = document.createElementNS("http://www.w3.org/2000/svg", tag)
+  for (const [name, value] of Object.entries(attributes)) node.setAttribute(name, value)
+  node.append(...children)
+  return node
+}
+
+const icon = (path) =>
+  drawing("svg", { viewBox: "0 0 24 24", "aria-hidden": "true" }, drawing("path", { d: path }))
+
 const figureViews = () => {
   const found = {}
   const look = (view) => {

@@ -2,16 +2,8 @@
 // deviation from the reference, inputs at their places, the surroundings outside.
 // Data come once with the run; the player says which sample is shown.
 
-const NAMESPACE = "http://www.w3.org/2000/svg"
 const WIDTH = 360, HEIGHT = 209, LEFT = 14, TOP = 74, METRE = 27.6
 const BAR = 88, BAR_HEIGHT = 9
-
-const drawing = (tag, attributes, ...children) => {
-  const node = document.createElementNS(NAMESPACE, tag)
-  for (const [name, value] of Object.entries(attributes)) node.setAttribute(name, value)
-  node.append(...children)
-  return node
-}
 
 // Blue, white, orange: told apart by any eye; dark words are read on all of them
 const COLD = [90, 165, 209], EVEN = [247, 247, 247], WARM = [232, 144, 58]

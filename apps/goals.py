@@ -140,6 +140,7 @@ class Bench:
 
     def __init__(self, trials: Sequence[Trial], plant: Any) -> None:
         self.trials, self.plant = list(trials), plant
+        self.suggested: list[Aim] = []
         self._values: dict[tuple[Design, str], float] = {}
         self._runs: dict[Design, list[Run]] = {}
 

@@ -11,16 +11,6 @@ const ICONS = {
   last: "M19 5v14M5 5l10 7-10 7z",
 }
 
-const icon = (name) => {
-  const svg = document.createElementNS("http://www.w3.org/2000/svg", "svg")
-  svg.setAttribute("viewBox", "0 0 24 24")
-  svg.setAttribute("aria-hidden", "true")
-  const path = document.createElementNS("http://www.w3.org/2000/svg", "path")
-  path.setAttribute("d", ICONS[name])
-  svg.append(path)
-  return svg
-}
-
 export function render({ model, el }) {
   let run = model.run
   const place = model.place   // where its words go, and what its samples are called
@@ -36,7 +26,7 @@ export function render({ model, el }) {
 
   const button = (name, label, action) => {
     const made = element("button", { type: "button", "aria-label": label, title: label })
-    made.append(icon(name))
+    made.append(icon(ICONS[name]))
     made.addEventListener("click", action)
     return made
   }
@@ -49,7 +39,7 @@ export function render({ model, el }) {
     playing = on
     status.setAttribute("aria-live", on ? "off" : "polite")
     if (on && time >= last()) time = 0
-    toggle.replaceChildren(icon(on ? "pause" : "play"))
+    toggle.replaceChildren(icon(ICONS[on ? "pause" : "play"]))
     const label = (on ? "Pause" : "Play") + hint("space")
     toggle.setAttribute("aria-label", label)
     toggle.title = label

@@ -624,12 +624,12 @@ class Choices(Holding):
                     f"structures: this case has no {name!r}; it has "
                     f"{', '.join(self._offered)}"
                 )
-        return {
-            name: self._held(name) if name in HELD else self._changed(known[name])
-            for name in self.structures
-        }
+        return {name: self._design(name) for name in self.structures}
 
-    def _held(self, name: str) -> Design:
+    def _design(self, name: str) -> Design:
+        """Return what is held as it is, or a design of the case with the choices."""
+        if name not in HELD:
+            return self._changed(self.example.designs[name])
         text = getattr(self, name)
         wrong = self.misfit(text) if text else "no design is held as such"
         if wrong:
@@ -1150,6 +1150,14 @@ _SCRIPT_IMPORTS = (
     "from nmss_lab.predict import Horizon",
     "from nmss_lab.simulate import closed_loop",
 )
+
+
+def literal(value: Any) -> str:
+    """Python of a number or an array, to the last digit."""
+    array = np.asarray(value, dtype=float)
+    if array.ndim == 0:
+        return repr(float(array))
+    return f"np.array({array.tolist()!r})".replace("inf", "np.inf")
 
 
 def _parts(text: str) -> list[str]:

@@ -21,6 +21,7 @@ from apps.session import (
     _round_number,
     held,
     known_case,
+    literal,
     plain,
 )
 from nmss_lab.analysis import OFFSET_FREE
@@ -46,6 +47,7 @@ def completed(example: Case) -> Case:
     return all_structures(example)
 
 
+@functools.lru_cache(maxsize=64)
 def unsuitable(example: Case) -> dict[str, str]:
     """Say of each predictive structure that does not suit a completed case why not."""
     main = next(iter(example.designs.values()))
@@ -242,14 +244,11 @@ class StructuresChoices(LoopChoices):
             If no design, or more than three, are to be plotted, or none can be built.
         """
         self.designs()
-        plant, scenario, known = self.plant(), self.scenario(), self.example.designs
+        plant, scenario = self.plant(), self.scenario()
         scores, reasons = dict[str, Score](), dict[str, str]()
         for name in self.rows:
             try:
-                design = (
-                    self._held(name) if name in HELD else self._changed(known[name])
-                )
-                design = self._in_place(design)
+                design = self._in_place(self._design(name))
                 scores |= compare({name: design}, plant, scenario, self.output)
             except ValueError as error:
                 reasons[name] = str(error).removeprefix(f"{name}: ")
@@ -312,9 +311,9 @@ class StructuresChoices(LoopChoices):
         N = self._samples
         change = self.step_r * np.eye(self.example.model.n_y)[self.output]
         lines = ["scenario = Scenario("]
-        lines.append(f"    piecewise({N}, ({FIRST}, {_literal(change)})),")
+        lines.append(f"    piecewise({N}, ({FIRST}, {literal(change)})),")
         for name, size in self._steps().items():
-            series = f"piecewise({N}, ({self._first}, {_literal(size)}))"
+            series = f"piecewise({N}, ({self._first}, {literal(size)}))"
             lines.append(f"    {name}={series},")
         return [*lines, ")"]
 
@@ -323,7 +322,7 @@ class StructuresChoices(LoopChoices):
         point = self._operating_point
         if point is None:
             return []
-        u0, y0 = map(_literal, point)
+        u0, y0 = map(literal, point)
         return [
             f"u0 = {u0}",
             f"y0 = {y0}",
@@ -368,10 +367,6 @@ class StructuresChoices(LoopChoices):
     def script(self) -> str:
         """Python that computes what the page shows."""
         return self.sheet_script(self.rows)
-
-
-def _literal(values: Array) -> str:
-    return f"np.array({np.asarray(values, float).tolist()!r})"
 
 
 def usual_step(example: Case) -> float:

@@ -12,7 +12,7 @@ import param
 from scipy.signal import lfilter
 
 from apps.goals import KINDS, MOST_GOALS, OVER, Aim, Bench, aims_of
-from apps.session import KEPT, LoopChoices, Origin, keep_case, known_case
+from apps.session import KEPT, LoopChoices, Origin, keep_case, known_case, literal
 from nmss_lab.cases import Case, piecewise, stress
 from nmss_lab.design import Design
 from nmss_lab.files import dumps
@@ -455,7 +455,9 @@ class TuneChoices(LoopChoices):
         """Rows that were chosen, or those that suit the design to begin with."""
         if self.goals:
             return aims_of(self.goals, self.example.model.n_y)
-        return self._suggested(bench)
+        if not bench.suggested:
+            bench.suggested = self._suggested(bench)
+        return list(bench.suggested)
 
     def _suggested(self, bench: Bench) -> list[Aim]:
         n_y = self.example.model.n_y
@@ -588,7 +590,7 @@ class TuneChoices(LoopChoices):
         if gain is not None:
             names = ["from nmss_lab.matching import match"]
             lines += [
-                *_wrapped(f"K = {_array(gain)}"),
+                *_wrapped(f"K = {literal(gain)}"),
                 "found = match(K, design)",
                 "print(found.distance, found.lost)",
             ]
@@ -604,7 +606,7 @@ class TuneChoices(LoopChoices):
         parts = [f"horizon=Horizon({design.horizon.Np}, {design.horizon.Nc})"]
         parts = [] if design.structure == "pip" else parts
         parts += [
-            f"{letter}={_array(getattr(design, letter))}"
+            f"{letter}={literal(getattr(design, letter))}"
             for letter in ("Q", "R")
             if getattr(design, letter) is not getattr(known, letter)
         ]
@@ -614,7 +616,7 @@ class TuneChoices(LoopChoices):
         if design.reference != known.reference:
             parts.append(f'reference="{design.reference}"')
         if design.options.get("K") is not known.options.get("K"):
-            K = _array(design.options["K"])
+            K = literal(design.options["K"])
             parts.append(f'options={{**{own}.options, "K": {K}}}')
         lines = [line for part in parts for line in _wrapped(f"    {part},")]
         return [f"{name} = replace(", f"    {own},", *lines, ")"]
@@ -633,7 +635,7 @@ class TuneChoices(LoopChoices):
                 "",
                 "",
                 "def first_order(reference, lag, pole):",
-                f"    rest = {_array(self.rest)}",
+                f"    rest = {literal(self.rest)}",
                 "    b, a = [0.0] * lag + [1.0 - pole], [1.0, -pole]",
                 "    return rest + lfilter(b, a, reference - rest, axis=0)",
                 "",
@@ -706,7 +708,7 @@ class TuneChoices(LoopChoices):
             v = f"np.tile(example.scenario.v[0], ({self.length}, 1))"
         scenario = [
             "example.scenario,",
-            f"reference={_array(self.rest)} + piecewise({self.length}, (1, change)),",
+            f"reference={literal(self.rest)} + piecewise({self.length}, (1, change)),",
             f"v={v},",
             "input_disturbance=None,",
             "output_disturbance=None,",
@@ -719,7 +721,7 @@ class TuneChoices(LoopChoices):
             "    replace(",
             *(f"        {line}" for line in scenario),
             "    )",
-            f"    for change in np.diag({_array(self._sizes)})",
+            f"    for change in np.diag({literal(self._sizes)})",
             "]",
             "trials = [Trial(plants, scenario) for scenario in scenarios]",
         ]
@@ -751,14 +753,6 @@ def first_order(reference: Array, rest: Array, lag: int, pole: float) -> Array:
     b, a = [0.0] * lag + [1.0 - pole], [1.0, -pole]
     desired: Array = rest + lfilter(b, a, reference - rest, axis=0)
     return desired
-
-
-def _array(value: Any) -> str:
-    """Python of a number or an array, to the last digit."""
-    array = np.asarray(value, dtype=float)
-    if array.ndim == 0:
-        return repr(float(array))
-    return f"np.array({array.tolist()!r})"
 
 
 def _wrapped(line: str) -> list[str]:

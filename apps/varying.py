@@ -12,7 +12,7 @@ import numpy as np
 import param
 
 from apps.kept import KEPT
-from apps.session import DesignChoices, known_case, plain
+from apps.session import DesignChoices, known_case, literal, plain
 from nmss_lab.cases import VARYING_CASES, Case, equation_case
 from nmss_lab.convergence import Best, Iterate, best_plan, iterates
 from nmss_lab.design import Design
@@ -378,8 +378,7 @@ class VaryingChoices(DesignChoices):
     def _scenario_lines(self) -> list[str]:
         first, *others = super()._scenario_lines()
         scenario = self.scenario()
-        y0 = [float(value) for value in np.ravel(scenario.y0)]
-        start = f"y0=np.array({y0!r}), u0={self.u_start!r}"
+        start = f"y0={literal(np.ravel(scenario.y0))}, u0={self.u_start!r}"
         lines = [first, f"scenario = replace(scenario, {start})"]
         if scenario.manual is not None:
             by_hand = "np.isfinite(scenario.manual)"

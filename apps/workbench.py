@@ -22,7 +22,7 @@ from apps.goals import Aim
 from apps.identification import RECORDS, IdentifyChoices
 from apps.kept import Origin, keep_case
 from apps.robustness import RobustnessChoices
-from apps.session import HELD, head, held_as, keep_model, plain
+from apps.session import HELD, head, held_as, keep_model, literal, plain
 from apps.tuning import TuneChoices
 from nmss_lab.analysis import Review, review
 from nmss_lab.cases import Case, model_case, piecewise
@@ -937,14 +937,14 @@ def _case_lines(choices: WorkbenchChoices) -> list[str]:
     lines = [
         "example = model_case(best.to_model(), best.covariance)",
         "# what was taken away from outputs and inputs: all below are deviations",
-        f"rest_y, rest_u = {_array(rest_y)}, {_array(rest_u)}",
+        f"rest_y, rest_u = {literal(rest_y)}, {literal(rest_u)}",
         "limits = Limits(",
         *(
-            f"    {key}=({_array(sides[f'{key}_low'])} - rest_{key}, "
-            f"{_array(sides[f'{key}_high'])} - rest_{key}),"
+            f"    {key}=({literal(sides[f'{key}_low'])} - rest_{key}, "
+            f"{literal(sides[f'{key}_high'])} - rest_{key}),"
             for key in ("u", "y")
         ),
-        f"    du=({_array(-du)}, {_array(du)}),",
+        f"    du=({literal(-du)}, {literal(du)}),",
         ")",
         f'name = "{name}"',
         "known, scenario = example.designs, example.scenario",
@@ -1059,12 +1059,6 @@ def script(bench: Bench, choices: WorkbenchChoices) -> str:
         if "np." not in text:
             text = text.replace("import numpy as np\n\n", "")
     return text
-
-
-def _array(values: Array) -> str:
-    """Python of a row of numbers, to the last digit."""
-    inside = ", ".join(repr(float(x)) for x in values)
-    return f"np.array([{inside}])".replace("inf", "np.inf")
 
 
 # Limits as text

@@ -102,8 +102,17 @@ class LinearLoop:
 
     def poles_of(self, which: Transfer) -> Array:
         """Poles that one transfer shows: those its input reaches and y tells of."""
-        B = np.hstack(list(self.B_r)) if which == "T" else self._input(which, 1.0)
-        return np.linalg.eigvals(minimal_realisation(self.A, B, self.C)[0])
+        name = "S_o" if which == "T_o" else which  # T_o = I - S_o has the same
+        if name not in self._poles_of:
+            B = np.hstack(list(self.B_r)) if name == "T" else self._input(name, 1.0)
+            shown = minimal_realisation(self.A, B, self.C)[0]
+            self._poles_of[name] = np.linalg.eigvals(shown)
+        return self._poles_of[name]
+
+    @cached_property
+    def _poles_of(self) -> dict[Transfer, Array]:
+        """Poles that transfers show, as far as somebody has asked."""
+        return {}
 
     def comes_to_rest(self, which: Transfer) -> bool:
         """Whether the response to a step of that input settles, hidden modes aside."""

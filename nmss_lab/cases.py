@@ -1191,13 +1191,19 @@ def _companions(design: Design) -> dict[str, Design]:
     if isinstance(model, StateDependentModel):
         moves = Design("sdp_increments", model, design.horizon, limits=design.limits)
         return _schemes(design if design.structure in SDP_STRUCTURES else moves)
-    if design.structure == "governor":
-        return {"pip": Design("pip", model, limits=design.limits, options={"K": K})}
-    if design.structure == "pip":
-        horizon = Horizon(design.horizon.Np, design.horizon.Np)
-        governor = Design("governor", model, horizon, limits=design.limits)
-        return {"governor": dataclasses.replace(governor, options={"K": K})}
-    return {}
+    if design.structure not in ("pip", "governor"):
+        return {}
+    pair = _pair(model, K, design.limits, design.horizon.Np)
+    return {name: other for name, other in pair.items() if name != design.structure}
+
+
+def _pair(
+    model: DifferenceModel, K: Array | None, limits: Limits, Np: int
+) -> dict[str, Design]:
+    """Gain alone, and with a governor of its reference."""
+    pip = Design("pip", model, limits=limits, options={"K": K})
+    governor = dataclasses.replace(pip, structure="governor", horizon=Horizon(Np, Np))
+    return {"pip": pip, "governor": governor}
 
 
 def governed(example: Case) -> Case:
@@ -1227,13 +1233,11 @@ def governed(example: Case) -> Case:
         raise ValueError(f"{example.name}: a state-dependent plant has governors else")
     first = next(iter(designs.values()))
     K, source = _gain_of(example)
-    Np = min(first.horizon.Np, 40)
-    pip = Design("pip", first.model, limits=first.limits, options={"K": K})
-    governor = dataclasses.replace(pip, structure="governor", horizon=Horizon(Np, Np))
+    pair = _pair(example.model, K, first.limits, min(first.horizon.Np, 40))
     note = f"The governor is over the gain {source}, with the limits of the case."
     return dataclasses.replace(
         example,
-        designs={**designs, "pip": designs.get("pip", pip), "governor": governor},
+        designs={**designs, **pair, "pip": designs.get("pip", pair["pip"])},
         notes=(note, *example.notes),
     )
 
@@ -1266,10 +1270,7 @@ def _governed(design: Design, gains: Array, Np: int) -> dict[str, Design]:
         return {}
     # a little more than the reference of 1 needs
     most = 1.2 / np.maximum(gains, 1e-3 * gains.max())
-    limits = Limits(u=(-most, most))
-    pip = Design("pip", model, limits=limits, options={"K": K})
-    governor = dataclasses.replace(pip, structure="governor", horizon=Horizon(Np, Np))
-    return {"pip": pip, "governor": governor}
+    return _pair(model, K, Limits(u=(-most, most)), Np)
 
 
 def _trial(model: DifferenceModel, Np: int, gains: Array) -> Scenario:

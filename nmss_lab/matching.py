@@ -19,6 +19,7 @@ import scipy.optimize
 from nmss_lab.analysis import ControlPolynomials, control_polynomials, linear_loop
 from nmss_lab.controller import Limits
 from nmss_lab.design import Design
+from nmss_lab.measures import first_reach
 from nmss_lab.models import Array, DifferenceModel
 from nmss_lab.mpc import STRUCTURES, state_weight
 from nmss_lab.nmss import integral_of_error_form
@@ -332,14 +333,6 @@ def _rise(design: Design) -> float:
         if (np.array(done) >= 0.9).any(axis=0).all():
             break
         state = loop.A @ state + by_r
-    rises = [_reach(y, 0.9) - _reach(y, 0.1) for y in np.array(done).T]
-    return float(np.mean(rises)) * model.dt
-
-
-def _reach(y: Array, level: float) -> float:
-    """First time, in samples, at which a response from zero is at a level."""
-    beyond = np.flatnonzero(y >= level)
-    if not beyond.size:
-        return np.nan
-    k = int(beyond[0])
-    return float(k - (y[k] - level) / (y[k] - y[k - 1]))
+    t, responses = model.dt * np.arange(len(done)), np.array(done).T
+    rises = [first_reach(t, y, 0.9) - first_reach(t, y, 0.1) for y in responses]
+    return float(np.mean(rises))

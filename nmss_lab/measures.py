@@ -114,10 +114,8 @@ def measures(run: Run, channel: int = 0) -> Measures:
         If the run has no such output.
     """
     _check_channel(run, channel)
-    points = _points(run)
-    r = np.repeat(run.r[:, channel], points)
-    error = np.abs(r - run.y_fine[_window(run, 0, len(run)), channel])
-    alone = np.repeat(_others_changed(run, channel), points)
+    error = _errors(run, channel)
+    alone = np.repeat(_others_changed(run, channel), _points(run))
     return Measures(
         steps=steps(run, channel),
         iae=_integral(run, error),
@@ -162,9 +160,7 @@ def iae(run: Run, channel: int = 0, first: int = 0, until: int | None = None) ->
         If the run has no such output.
     """
     _check_channel(run, channel)
-    last = len(run) if until is None else until
-    r = np.repeat(run.r[first:last, channel], _points(run))
-    return _integral(run, np.abs(r - run.y_fine[_window(run, first, last), channel]))
+    return _integral(run, _errors(run, channel, first, until))
 
 
 def rejection(
@@ -198,11 +194,10 @@ def rejection(
     ):
         if not 0 <= value < size:
             raise ValueError(f"{name} = {value}: expected 0 to {size - 1}")
-    r = np.repeat(run.r[first:, channel], _points(run))
-    error = np.abs(r - run.y_fine[_window(run, first, len(run)), channel])
+    error = _errors(run, channel, first)
     return {
         "peak": float(error.max()),
-        "IAE": iae(run, channel, first),
+        "IAE": _integral(run, error),
         "travel": float(np.abs(run.du[first:, input]).sum()),
     }
 
@@ -260,14 +255,22 @@ def _step(run: Run, channel: int, k: int, end: int, before: float) -> StepMeasur
     return StepMeasures(
         start=float(run.t[k]),
         size=r - before,
-        t10=_first_reach(t, done, 0.1),
-        t90=_first_reach(t, done, 0.9),
+        t10=first_reach(t, done, 0.1),
+        t90=first_reach(t, done, 0.9),
         settling=_settled(t, np.abs(done - 1.0) <= 0.05),
         overshoot=max(float(done[farthest]) - 1.0, 0.0),
         undershoot=float(done.min()),
         peak=float(y[farthest]),
         iae=_integral(run, np.abs(y - r)),
     )
+
+
+def _errors(run: Run, channel: int, first: int = 0, until: int | None = None) -> Array:
+    """Absolute errors of an output, between the samples too, of some samples."""
+    last = len(run) if until is None else until
+    r = np.repeat(run.r[first:last, channel], _points(run))
+    errors: Array = np.abs(r - run.y_fine[_window(run, first, last), channel])
+    return errors
 
 
 def _window(run: Run, k: int, end: int) -> slice:
@@ -278,7 +281,7 @@ def _window(run: Run, k: int, end: int) -> slice:
     return slice(k, end)
 
 
-def _first_reach(t: Array, done: Array, share: float) -> float:
+def first_reach(t: Array, done: Array, share: float) -> float:
     """First time at which ``done`` rises to ``share``; nan if it never does."""
     above = done >= share
     if not above.any():

@@ -10,7 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.linalg
 
 from nmss_lab.controller import Status
 from nmss_lab.models import Array
@@ -113,10 +112,9 @@ def _more_room(
     assert run.moves is not None
     program, multipliers = controller.program, run.multipliers[k]
     sign = np.sign(multipliers[held])
-    rows = program.M[held]
-    push = scipy.linalg.solve(program.H, rows.T, assume_a="pos")
+    push = program.push[:, held]
     # what the decision, and the multipliers, do for a unit more room in each
-    inverse = np.linalg.pinv(rows @ push, hermitian=True)
+    inverse = np.linalg.pinv(program.M[held] @ push, hermitian=True)
     change = push @ inverse * sign
     drop = -inverse * sign
     z, theta = run.moves.decision[k], run.moves.known[k]

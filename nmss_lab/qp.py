@@ -111,6 +111,12 @@ class QuadraticProgram:
         return free - push @ np.linalg.solve(E @ push, E @ free + e)
 
     @cached_property
+    def push(self) -> Array:
+        """Change of the free optimum for a unit force in each row, H^-1 M'."""
+        push: Array = scipy.linalg.cho_solve(scipy.linalg.cho_factor(self.H), self.M.T)
+        return push
+
+    @cached_property
     def rows(self) -> dict[str, Array]:
         """Row numbers of each kind of limit."""
         kinds = dict.fromkeys(label.name for label in self.labels)

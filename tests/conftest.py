@@ -308,3 +308,15 @@ def slide(page: Page, name: str, end: str) -> None:
 def picture(page: Page) -> str:
     """Return the pixels of the first chart."""
     return str(page.locator(".chart").first.screenshot())
+
+
+ROUND = """() => {
+  const find = (view) => view.model?.name === "poles" ? view
+    : (view.child_views ?? []).map(find).find(Boolean)
+  const roots = Object.values(Bokeh.index.roots ?? Bokeh.index)
+  const { frame } = roots.map(find).find(Boolean)
+  const across = frame.x_scale.compute(1) - frame.x_scale.compute(0)
+  const up = frame.y_scale.compute(0) - frame.y_scale.compute(1)
+  return Math.abs(across / up - 1) < 0.02
+}"""
+"""Whether the unit circle of a figure of poles is round, in JavaScript."""

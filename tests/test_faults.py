@@ -16,7 +16,7 @@ from typing import Any
 
 import pytest
 from conftest import Server
-from test_serving import children, health, serving, until, wait_for_none
+from test_serving import LINUX, children, health, serving, until, wait_for_none
 from visitors import Visitor, run
 
 import apps.work
@@ -26,8 +26,6 @@ from apps.work import ENDED, Lent
 from nmss_lab.cases import case
 from nmss_lab.cli import main
 from nmss_lab.files import load, save
-
-LINUX = pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 
 FAULTY = """
 import sys

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import Open, Server, watched
+from conftest import ROUND, Open, Server, watched
 from playwright.sync_api import Browser, Page, expect
 
 from apps.pages.robustness import LOOK, RobustnessPage
@@ -572,14 +572,4 @@ PLACE = """() => {
   const box = view.el.getBoundingClientRect()
   return { x: box.x + view.frame.x_scale.compute(t[i]),
     y: box.y + view.frame.y_scale.compute(y[i]), number: number[i] }
-}"""
-
-ROUND = """() => {
-  const find = (view) => view.model?.name === "poles" ? view
-    : (view.child_views ?? []).map(find).find(Boolean)
-  const roots = Object.values(Bokeh.index.roots ?? Bokeh.index)
-  const { frame } = roots.map(find).find(Boolean)
-  const across = frame.x_scale.compute(1) - frame.x_scale.compute(0)
-  const up = frame.y_scale.compute(0) - frame.y_scale.compute(1)
-  return Math.abs(across / up - 1) < 0.02
 }"""

@@ -9,10 +9,19 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-import param
 import pytest
-from conftest import REPLAY, Open, Server, picture, settled, slide, watched
+from conftest import (
+    REPLAY,
+    ROUND,
+    Open,
+    Server,
+    picture,
+    settled,
+    slide,
+    watched,
+)
 from playwright.sync_api import Browser, Page, expect
+from test_dashboard import anything
 
 from apps.pages.structures import COLUMNS, LOOK, StructuresPage
 from apps.session import held, keep_case, keep_model
@@ -337,22 +346,6 @@ def test_every_choice_is_explained() -> None:
                 assert item["low"] < item["high"]
 
 
-def anything(choices: StructuresChoices, rng: np.random.Generator) -> None:
-    """Put every choice anywhere within its bounds, often at an end."""
-    for item in (item for group in choices.description() for item in group["items"]):
-        name, parameter = item["name"], choices.param[item["name"]]
-        if item["kind"] in ("linear", "log"):
-            low, high = parameter.bounds
-            values = [low, high, rng.uniform(low, high), getattr(choices, name)]
-            value = values[rng.integers(4)]
-            whole = isinstance(parameter, param.Integer)
-            setattr(choices, name, int(value) if whole else float(value))
-        elif item["kind"] == "one" and name != "case":
-            options = [value for value, _ in item["options"]]
-            setattr(choices, name, options[rng.integers(len(options))])
-    choices.samples = min(choices.samples, 80)
-
-
 @pytest.mark.filterwarnings("error")
 def test_any_combination_is_scored_or_explained(rng: np.random.Generator) -> None:
     """Whatever is chosen, there is a sheet with pictures or a sentence."""
@@ -622,14 +615,3 @@ def test_the_run_shown_is_that_of_the_library() -> None:
         design = choices.example.designs[name]
         run = closed_loop(choices.plant(), design.build(), choices.scenario())
         assert np.array_equal(run.y, score.run.y)
-
-
-ROUND = """() => {
-  const find = (view) => view.model?.name === "poles" ? view
-    : (view.child_views ?? []).map(find).find(Boolean)
-  const roots = Object.values(Bokeh.index.roots ?? Bokeh.index)
-  const { frame } = roots.map(find).find(Boolean)
-  const across = frame.x_scale.compute(1) - frame.x_scale.compute(0)
-  const up = frame.y_scale.compute(0) - frame.y_scale.compute(1)
-  return Math.abs(across / up - 1) < 0.02
-}"""

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import jinja2
 import panel as pn
@@ -22,9 +22,12 @@ from apps.microscope import Microscope, magnified
 from apps.pages.bar import FAULT, WithBar
 from apps.player import INSIDE, Controls, Player, moving, stepping
 from apps.session import HELD, Choices, plain
+from nmss_lab.cases import Case
 from nmss_lab.measures import table
 from nmss_lab.plots import Chart, ChartFigure, busiest_sample, time_unit
 from nmss_lab.simulate import Run
+
+Opened = TypeVar("Opened")
 
 LOG = logging.getLogger(__name__)
 HERE = Path(__file__).resolve().parent.parent
@@ -94,7 +97,17 @@ class WithForm:
     """A page whose form is described anew whenever its choices become others."""
 
     choices: Any
+    complaint: str
     _forms = 0
+
+    def _opened(self, action: Callable[[], Opened]) -> Opened:
+        """Do it with the choices of the address; if it cannot be, with the case's."""
+        try:
+            return action()
+        except ValueError as error:
+            self.complaint = self.complaint or f"{ADDRESS}{error}"
+            self.choices.take_case(self.choices.case)
+            return action()
 
     def _form(self) -> dict[str, Any]:
         choices = self.choices
@@ -132,7 +145,7 @@ class LivePage(WithForm, WithBar):
         self.lead, self.alert, self.measures, self.python, self.notes = (
             _text(name) for name in ("lead", "alert", "measures", "python", "notes")
         )
-        self.runs, charts = self._first_picture()
+        self.runs, charts = self._opened(self._compute)
         times = Range1d(*charts[0].span)
         self.figures = {chart.name: ChartFigure(chart, times) for chart in charts}
         self.player = Player(
@@ -148,15 +161,6 @@ class LivePage(WithForm, WithBar):
         self._make_bar()
         self._tell()
         self._measure()
-
-    def _first_picture(self) -> tuple[dict[str, Run], list[Chart]]:
-        """Run the choices of the address, or the case as it is if they cannot be."""
-        try:
-            return self._compute()
-        except ValueError as error:
-            self.complaint = self.complaint or f"{ADDRESS}{error}"
-            self.choices.take_case(self.choices.case)
-            return self._compute()
 
     def _first_inside(self) -> Player | None:
         """Figures and player of one sample from within, where the page has them."""
@@ -221,10 +225,7 @@ class LivePage(WithForm, WithBar):
         example, look = self.choices.example, self.subject.look
         self.lead.object = _paragraph(look.get(example.name, example.title + "."))
         self.alert.object = _complaint(self.complaint)
-        notes = "".join(f"<li>{html.escape(note)}</li>" for note in example.notes)
-        section = f"Section {example.section}. " if example.section else ""
-        source = html.escape(f"{section}{example.source}.")
-        self.notes.object = f"<p>{source}</p><ul>{notes}</ul>"
+        self.notes.object = _notes(example)
         self.bar.told = self._loaded()
 
     def _measure(self) -> None:
@@ -336,6 +337,14 @@ def _from_address(choices: Choices) -> str:
 
 def _paragraph(text: str) -> str:
     return f"<p>{html.escape(text)}</p>"
+
+
+def _notes(example: Case, more: str = "") -> str:
+    """Where a case is from, more about it, and what it assumes."""
+    section = f"Section {example.section}. " if example.section else ""
+    source = html.escape(f"{section}{example.source}. {more}".strip())
+    notes = "".join(f"<li>{html.escape(note)}</li>" for note in example.notes)
+    return f"<p>{source}</p><ul>{notes}</ul>"
 
 
 def _complaint(text: str) -> str:

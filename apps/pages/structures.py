@@ -15,10 +15,10 @@ from panel.custom import JSComponent
 from apps.pages.background import BackgroundPage
 from apps.pages.bar import WithBar
 from apps.pages.live import (
-    ADDRESS,
     WithForm,
     _complaint,
     _from_address,
+    _notes,
     _number,
     _paragraph,
     _text,
@@ -132,7 +132,7 @@ class StructuresPage(WithForm, WithBar, BackgroundPage):
         self.lead, self.alert, self.legend, self.python, self.notes = (
             _text(name) for name in ("lead", "alert", "legend", "python", "notes")
         )
-        self.found, self.scored = self._first_sheet()
+        self.found, self.scored = self._opened(self._scored)
         self.figures = _figures(self._charts())
         self.sheet = ScoreSheet(figures=len(self.figures), sizing_mode="stretch_width")
         self.controls = Controls(
@@ -141,15 +141,6 @@ class StructuresPage(WithForm, WithBar, BackgroundPage):
         self._make_bar()
         self._tell()
         self._tabulate()
-
-    def _first_sheet(self) -> tuple[Sheet, dict[str, Any]]:
-        """Score the choices of the address, or the case as it is if they cannot be."""
-        try:
-            return self._scored()
-        except ValueError as error:
-            self.complaint = self.complaint or f"{ADDRESS}{error}"
-            self.choices.take_case(self.choices.case)
-            return self._scored()
 
     def _scored(self) -> tuple[Sheet, dict[str, Any]]:
         """Score; at least one of the rows that are to be plotted has scores."""
@@ -208,11 +199,10 @@ class StructuresPage(WithForm, WithBar, BackgroundPage):
         example = self.choices.example
         self.lead.object = _paragraph(LOOK.get(example.name, f"{example.title}."))
         self.alert.object = _complaint(self.complaint)
-        notes = "".join(f"<li>{html.escape(note)}</li>" for note in example.notes)
-        source = html.escape(f"Section {example.section}. {example.source}.")
-        self.notes.object = (
-            f"<p>{source} The scenario is the page's own: disturbances are steps, and "
-            f"no internal model sees them.</p><ul>{notes}</ul>"
+        self.notes.object = _notes(
+            example,
+            "The scenario is the page's own: disturbances are steps, and no internal "
+            "model sees them.",
         )
         self.bar.told = self._loaded()
 
