@@ -16,12 +16,14 @@ from __future__ import annotations
 import dataclasses
 import enum
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
 
+from nmss_lab.laws import Law
 from nmss_lab.models import Array, DifferenceModel
 from nmss_lab.nmss import Form
 
@@ -166,9 +168,9 @@ _SENTENCES = {
 }
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False, slots=True)
 class Memory:
-    """All that changes in a controller from sample to sample.
+    """All that changes in a controller from sample to sample; never changed itself.
 
     Parameters
     ----------
@@ -180,6 +182,8 @@ class Memory:
         Samples since that plan was made; -1 when there is none.
     refused : bool array (...)
         Whether the latest measurement was not finite.
+    law : Law, optional
+        Law of a single loop's last move, the first to be looked at for the next.
     """
 
     vector: Array
@@ -188,9 +192,10 @@ class Memory:
     multipliers: Array
     shift: Array
     refused: Array
+    law: Law | None = None
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False, slots=True)
 class Move:
     """Decision of one sample.
 
@@ -216,6 +221,8 @@ class Move:
     iterations : integer array (...)
     shift : integer array (...)
         Age of the plan in samples: 0 when it was made now.
+    law : Law, optional
+        The law that gave the move of a single loop, where one did.
     """
 
     u: Array
@@ -228,6 +235,7 @@ class Move:
     multipliers: Array
     iterations: Array
     shift: Array
+    law: Law | None = field(default=None, init=False)
 
     @property
     def active(self) -> Array:
@@ -395,17 +403,28 @@ class Controller(ABC):
         layout, model = self.form.recipe.layout, self.model
         before = memory.vector
         y, r = _channels("y", y, model.n_y), _channels("r", r, model.n_y)
-        if not np.isfinite(r).all():
-            raise ValueError(f"r = {r} is not finite")
         v = layout.read(before, "v")[..., 0, :] if v is None else v
         v = _channels("v", v, model.n_v)
-        good = np.isfinite(y).all(axis=-1) & np.isfinite(v).all(axis=-1)
-        if not np.all(good):
+        parts = [before, *(_alike(part, before) for part in (y, v, r))]
+        both = np.concatenate(parts, axis=-1)
+        finite = np.isfinite(both[..., before.shape[-1] :])
+        good = finite[..., : model.n_y + model.n_v].all(axis=-1)
+        if not finite.all():
+            if not np.isfinite(r).all():
+                raise ValueError(f"r = {r} is not finite")
             y = np.where(np.isfinite(y), y, self._expected(before))
             v = np.where(np.isfinite(v), v, layout.read(before, "v")[..., 0, :])
-        parts = [before, *(_alike(part, before) for part in (y, v, r))]
-        vector = np.concatenate(parts, axis=-1) @ self._measuring.T
-        return dataclasses.replace(memory, vector=vector, refused=~np.asarray(good))
+            parts[1:3] = _alike(y, before), _alike(v, before)
+            both = np.concatenate(parts, axis=-1)
+        return Memory(
+            both @ self._measuring.T,
+            memory.decision,
+            memory.known,
+            memory.multipliers,
+            memory.shift,
+            ~np.asarray(good),
+            memory.law,
+        )
 
     @cached_property
     def _measuring(self) -> Array:
@@ -443,17 +462,24 @@ class Controller(ABC):
         ValueError
             If r or v is not finite or has another shape.
         """
-        layout = self.form.recipe.layout
         single = memory.vector.ndim == 1
         many = as_ensemble(memory) if single else memory
-        r_now = layout.read(many.vector, "r")
-        v_now = layout.read(many.vector, "v")[:, 0]
-        r_all = _ahead("r", r, r_now, 1 + self.preview)
-        v_all = _ahead("v", v, v_now, 1 + self.forecast_steps)
-        move = self._decide(many, r_all, v_all)
+        move = self._decide(many, *self._given(many, r, v))
         worse = many.refused & (move.status < Status.REFUSED)
         move.status[worse] = Status.REFUSED
         return Move(*(part[0] for part in _parts(move))) if single else move
+
+    def _given(
+        self, memory: Memory, r: Array | None, v: Array | None
+    ) -> tuple[Array, Array]:
+        """Give r and v from sample k on, for memories with a leading axis."""
+        layout = self.form.recipe.layout
+        r_now = layout.read(memory.vector, "r")
+        v_now = layout.read(memory.vector, "v")[:, 0]
+        return (
+            _ahead("r", r, r_now, 1 + self.preview),
+            _ahead("v", v, v_now, 1 + self.forecast_steps),
+        )
 
     def apply(
         self, memory: Memory, u: Array, move: Move, seen: Array | None = None
@@ -479,7 +505,7 @@ class Controller(ABC):
         layout = self.form.recipe.layout
         u = _channels("u", u, self.model.n_u)
         seen = u if seen is None else _channels("seen", seen, self.model.n_u)
-        if not (np.isfinite(u).all() and np.isfinite(seen).all()):
+        if not (np.isfinite(u).all() and (seen is u or np.isfinite(seen).all())):
             raise ValueError(f"u = {u}, seen as {seen}, is not finite")
         vector = memory.vector
         if "integral" in layout:
@@ -493,6 +519,7 @@ class Controller(ABC):
             move.multipliers,
             move.shift,
             memory.refused,
+            move.law,
         )
 
     def _followed(self, memory: Memory, u: Array, move: Move) -> Array:
@@ -577,7 +604,8 @@ def signal(name: str, value: Array | None, size: int) -> Array:
 
 def _channels(name: str, value: Any, size: int) -> Array:
     """Signals (..., size) as numbers; a plain number is one channel."""
-    array = np.atleast_1d(np.asarray(value, dtype=float))
+    array = np.asarray(value, dtype=float)
+    array = array if array.ndim else array[None]
     if array.shape[-1:] != (size,):
         raise ValueError(f"{name} has shape {array.shape}, expected (..., {size})")
     return array
@@ -585,7 +613,7 @@ def _channels(name: str, value: Any, size: int) -> Array:
 
 def _alike(value: Array, memory: Array) -> Array:
     """Signals (n,) or (loops, n) with the leading axes of a memory."""
-    if value.ndim == memory.ndim and len(value) == len(memory):
+    if value.shape[:-1] == memory.shape[:-1]:
         return value
     return np.broadcast_to(value, (*memory.shape[:-1], value.shape[-1]))
 
@@ -610,8 +638,20 @@ def _ahead(name: str, given: Array | None, now: Array, steps: int) -> Array:
 
 def as_ensemble(memory: Memory) -> Memory:
     """Memory of one loop with a leading axis, as an ensemble of one."""
-    return Memory(*(np.asarray(part)[None] for part in _parts(memory)))
+    return _memory(np.asarray(part)[None] for part in _parts(memory))
+
+
+def stacked(memories: Sequence[Memory], rows: Array) -> Memory:
+    """Memory of an ensemble whose loops start as ``rows`` of some memories say."""
+    parts = zip(*map(_parts, memories), strict=True)
+    return _memory(np.stack(part)[rows] for part in parts)
+
+
+def _memory(parts: Iterable[Array]) -> Memory:
+    vector, decision, known, multipliers, shift, refused = parts
+    return Memory(vector, decision, known, multipliers, shift, refused)
 
 
 def _parts(record: Memory | Move) -> list[Array]:
-    return [getattr(record, part.name) for part in dataclasses.fields(record)]
+    names = (part.name for part in dataclasses.fields(record))
+    return [getattr(record, name) for name in names if name != "law"]

@@ -16,13 +16,14 @@ import numpy as np
 
 from nmss_lab.controller import Limits, Memory, Move, Status
 from nmss_lab.models import Array, DifferenceModel, Numbers
-from nmss_lab.nmss import Layout, integral_of_error_form
+from nmss_lab.nmss import Layout, Recipe, integral_of_error_form
 from nmss_lab.pip import gain
 from nmss_lab.predict import (
     Affine,
     Horizon,
+    at_each_step,
+    changes,
     decided,
-    difference,
     known_part,
     predict,
     stack,
@@ -60,6 +61,16 @@ class ReferenceGovernor(PredictiveController):
     def governs_ahead(self) -> int:
         """0 when w_k is chosen at k, 1 when w_{k+1} is."""
         return int(not self.causal)
+
+    @property
+    def follows_laws(self) -> bool:
+        """Whether the present input is part of the plan."""
+        return self.causal
+
+    @property
+    def in_force(self) -> Affine:
+        """The governed reference w_k."""
+        return self.signals["w"][: self.model.n_y]
 
     def _missed(self, memory: Memory, u: Array, move: Move) -> Array:
         """Way from what the gain asks for under the governed reference, to ``u``."""
@@ -100,7 +111,7 @@ def governor(
     reference: Literal["held", "preview"] = "held",
     free_until: int | None = None,
     decay: float = 1.0,
-    backend: str = "daqp",
+    backend: str = "active_set",
 ) -> ReferenceGovernor:
     r"""Build a reference governor over the law u = -K x.
 
@@ -163,7 +174,7 @@ def governor(
     size = free * p
     program = assemble([Cost(decided(np.eye(size), known), np.eye(size))], rows)
     ranks = np.array([int(row.name == "y") for row in program.labels], dtype=int)
-    knowledge = _knowledge(form.recipe.layout, form.recipe.state, known, causal, Np, p)
+    knowledge = _knowledge(model, form.recipe, known, causal, Np)
     return ReferenceGovernor(
         model,
         form,
@@ -208,21 +219,22 @@ def _signals(
     closed = A - B @ K
     X = predict([closed] * steps, [D] * steps, state, references, [D @ none] * steps)
     before = stack([state, X[slice(0, (steps - 1) * len(state))]])
-    U = np.kron(np.eye(steps), -K) @ before
+    U = at_each_step(-K, before)
     last = np.eye(steps * q, q) @ known_part(known, "u", w.gain.shape[1])
-    dU = difference(steps, q) @ U - last
-    return {"u": U, "du": dU, "y": np.kron(np.eye(steps), C) @ X}
+    dU = changes(U, q) - last
+    return {"u": U, "du": dU, "y": at_each_step(C, X)}
 
 
 def _knowledge(
-    memory: Layout, state: Array, known: Layout, causal: bool, Np: int, p: int
+    model: DifferenceModel, recipe: Recipe, known: Layout, causal: bool, Np: int
 ) -> Knowledge:
+    memory, p = recipe.layout, model.n_y
     from_memory = np.zeros((known.size, memory.size))
-    from_memory[known["x"]] = state
+    from_memory[known["x"]] = recipe.state
     from_memory[known["u"]] = memory.select("u")[: known.shapes["u"][0]]
     from_r = np.zeros((known.size, p if causal else (1 + Np) * p))
     if causal:
         from_memory[known["r"]] = memory.select("r")
     else:
         from_r[known["r"], p:] = np.eye(Np * p)
-    return Knowledge(known, from_memory, from_r, np.zeros((known.size, 0)))
+    return Knowledge(known, from_memory, from_r, np.zeros((known.size, model.n_v)))

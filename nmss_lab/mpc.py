@@ -27,13 +27,14 @@ from nmss_lab.pip import lq_cost
 from nmss_lab.predict import (
     Affine,
     Horizon,
+    at_each_step,
     blocks,
-    cumulate,
+    changes,
     decided,
-    difference,
     known_part,
     predict,
     stack,
+    sums,
 )
 from nmss_lab.predictive import (
     Forecast,
@@ -42,7 +43,14 @@ from nmss_lab.predictive import (
     limit,
     output_ranks,
 )
-from nmss_lab.qp import Cost, Limit, assemble, find_backend, weight
+from nmss_lab.qp import (
+    Cost,
+    Limit,
+    assemble,
+    find_backend,
+    weight,
+    weight_blocks,
+)
 
 Reading = Literal["held", "next", "preview", "zero"]
 """What S holds: r_k repeated, r_{k+1} repeated, the true future, or nothing (the
@@ -59,7 +67,7 @@ def integral_of_error(
     limits: Limits | None = None,
     reference: Reading = "held",
     terminal: Terminal = "none",
-    backend: str = "daqp",
+    backend: str = "active_set",
     anti_windup: bool = True,
 ) -> PredictiveController:
     r"""Predictive control with an integral-of-error state (thesis 4.2).
@@ -98,11 +106,11 @@ def integral_of_error(
     problem = Setup(model, form, horizon, reference, "held")
     U, dU = problem.levels()
     X = problem.predicted(U, [form.D @ r for r in problem.reference])
-    weight_x = weight("Q", Q, horizon.Np, form.n_x)
-    weight_u = weight("R", R, horizon.Nc, model.n_u)
+    weight_x = weight_blocks("Q", Q, horizon.Np, form.n_x)
+    weight_u = weight_blocks("R", R, horizon.Nc, model.n_u)
     if terminal == "lq":
-        last = slice((horizon.Np - 1) * form.n_x, None)
-        weight_x[last, last] = _riccati(form, weight_x[last, last], weight_u, model.n_u)
+        last = weight_x[-1, -form.n_x :, -form.n_x :]
+        last[:] = _riccati(form, last, weight_u, model.n_u)
     costs = [Cost(X, weight_x), Cost(problem.decision, weight_u)]
     built = problem.build(costs, U, dU, X, limits, terminal, backend)
     return replace(built, anti_windup=anti_windup)
@@ -116,7 +124,7 @@ def wang_young(
     limits: Limits | None = None,
     reference: Reading = "held",
     terminal: Terminal = "none",
-    backend: str = "daqp",
+    backend: str = "active_set",
 ) -> PredictiveController:
     r"""Predictive control of Wang and Young (2006), thesis 4.1.
 
@@ -150,7 +158,7 @@ def forward_path(
     limits: Limits | None = None,
     reference: Reading = "held",
     terminal: Terminal = "none",
-    backend: str = "daqp",
+    backend: str = "active_set",
 ) -> PredictiveController:
     """Forward-path predictive control (thesis 6.2).
 
@@ -174,7 +182,7 @@ def minimal(
     limits: Limits | None = None,
     reference: Reading = "held",
     terminal: Terminal = "none",
-    backend: str = "daqp",
+    backend: str = "active_set",
     observer: Literal["deadbeat", "kalman"] = "deadbeat",
 ) -> PredictiveController:
     """Predictive control on a minimal realisation with an observer (5.1.3).
@@ -202,7 +210,7 @@ def disturbance_direct(
     limits: Limits | None = None,
     reference: Reading = "held",
     terminal: Terminal = "none",
-    backend: str = "daqp",
+    backend: str = "active_set",
     forecast: Forecast = "held",
 ) -> PredictiveController:
     """Measured disturbances as known offsets of the prediction (thesis 7.2.2).
@@ -230,7 +238,7 @@ def disturbance_augmented(
     limits: Limits | None = None,
     reference: Reading = "held",
     terminal: Terminal = "none",
-    backend: str = "daqp",
+    backend: str = "active_set",
     forecast: Forecast = "held",
 ) -> PredictiveController:
     """Measured disturbances as part of the state (thesis 7.2.1, corrected).
@@ -277,9 +285,9 @@ def _incremental(
     problem = Setup(model, form, horizon, reference, forecast)
     U, dU = problem.increments()
     X = problem.predicted(dU, problem.disturbances())
-    weight_y = weight("Q", Q, horizon.Np, model.n_y)
-    weight_du = weight("R", R, horizon.Nc, model.n_u)
-    Y = np.kron(np.eye(horizon.Np), form.C) @ X
+    weight_y = weight_blocks("Q", Q, horizon.Np, model.n_y)
+    weight_du = weight_blocks("R", R, horizon.Nc, model.n_u)
+    Y = at_each_step(form.C, X)
     S = problem.stacked_reference()
     costs = [Cost(Y - S, weight_y), Cost(problem.decision, weight_du)]
     if terminal == "lq":
@@ -343,7 +351,7 @@ class Setup:
         U = decided(horizon.held(n_u), self.known)
         first = np.eye(horizon.Np * n_u, n_u)
         last_u = first @ known_part(self.known, "u", self.n_z)
-        return U, difference(horizon.Np, n_u) @ U - last_u
+        return U, changes(U, n_u) - last_u
 
     def increments(self) -> tuple[Affine, Affine]:
         """Give inputs, and their changes that are decided, Np n_u rows each."""
@@ -351,7 +359,7 @@ class Setup:
         dU = decided(horizon.impulses(n_u), self.known)
         ones = np.tile(np.eye(n_u), (horizon.Np, 1))
         last_u = ones @ known_part(self.known, "u", self.n_z)
-        return cumulate(horizon.Np, n_u) @ dU + last_u, dU
+        return sums(dU, n_u) + last_u, dU
 
     @property
     def reference(self) -> list[Affine]:
@@ -404,7 +412,7 @@ class Setup:
         model, horizon = self.model, self.horizon
         limits = limits or Limits()
         find_backend(backend)
-        Y = np.kron(np.eye(horizon.Np), self.form.C) @ X
+        Y = at_each_step(self.form.C, X)
         rows = self.rows(U, dU, Y, limits, terminal)
         program = assemble(costs, rows, "weights Q and R")
         return PredictiveController(
@@ -500,15 +508,14 @@ def state_weight(
 
 def _riccati(form: Form, Q: Array, R: Array, n_u: int) -> Array:
     """Cost-to-go from the last state; the cost counts x_{k+Np} itself as well."""
-    return lq_cost(form.A, form.B, Q, R[-n_u:, -n_u:])
+    return lq_cost(form.A, form.B, Q, R[-1, -n_u:, -n_u:])
 
 
 def _tail(problem: Setup, X: Affine, weight_y: Array, weight_du: Array) -> Cost:
     """LQ cost beyond the horizon, on the last state seen from rest at r."""
     form, model, Np = problem.form, problem.model, problem.horizon.Np
-    last_y, last_u = slice(-model.n_y, None), slice(-model.n_u, None)
-    Q = form.C.T @ weight_y[last_y, last_y] @ form.C
-    P = lq_cost(form.A, form.B, Q, weight_du[last_u, last_u])
+    Q = form.C.T @ weight_y[-1, -model.n_y :, -model.n_y :] @ form.C
+    P = lq_cost(form.A, form.B, Q, weight_du[-1, -model.n_u :, -model.n_u :])
     still = np.vstack([np.eye(form.n_x) - form.A, form.C])
     rest = np.linalg.pinv(still)[:, form.n_x :]
     x_last = X[_block(Np - 1, form.n_x)] - rest @ problem.reference[-1]

@@ -97,6 +97,43 @@ def blocks(signal: Affine, size: int) -> list[Affine]:
     return [signal[slice(i, i + size)] for i in range(0, len(signal), size)]
 
 
+def by_step(matrix: Array, rows: Array) -> Array:
+    """Product of the matrix of each step with its rows, one above the other.
+
+    ``matrix`` is one for all steps (m, n), or one for each (steps, m, n).
+    """
+    step = rows.reshape(-1, matrix.shape[-1], rows.shape[1])
+    product: Array = (matrix @ step).reshape(-1, rows.shape[1])
+    return product
+
+
+def at_each_step(matrix: Array, signal: Affine) -> Affine:
+    """Signal of which each step's part is multiplied by ``matrix`` (m, n)."""
+    return Affine(by_step(matrix, signal.gain), by_step(matrix, signal.known))
+
+
+def changes(signal: Affine, n: int) -> Affine:
+    """Difference of each step's part to the one before: C_2 of (3.10).
+
+    The first part, of ``n`` rows as all are, stays.
+    """
+    return signal - Affine(*(_later(part, n) for part in (signal.gain, signal.known)))
+
+
+def _later(part: Array, n: int) -> Array:
+    later = np.zeros_like(part)
+    later[n:] = part[:-n]
+    return later
+
+
+def sums(signal: Affine, n: int) -> Affine:
+    """Sum of all parts of ``n`` rows up to each: C_2 of section 7.3."""
+    parts = signal.gain, signal.known
+    return Affine(
+        *(p.reshape(-1, n, p.shape[1]).cumsum(axis=0).reshape(p.shape) for p in parts)
+    )
+
+
 def known_part(known: Layout, name: str, n_z: int) -> Affine:
     """Part ``name`` of the known vector as a signal that no decision moves."""
     rows = known.select(name)
@@ -247,13 +284,3 @@ class Horizon:
     def rows_of_moves(self, n: int) -> Array:
         """Rows of an Np n sequence at which a free move begins."""
         return (self.starts[:, None] * n + np.arange(n)).ravel()
-
-
-def difference(steps: int, n: int) -> Array:
-    """C_2 of (3.10): differences of a stacked sequence, (steps n, steps n)."""
-    return np.eye(steps * n) - np.eye(steps * n, k=-n)
-
-
-def cumulate(steps: int, n: int) -> Array:
-    """C_2 of section 7.3: running sums of a stacked sequence, (steps n, steps n)."""
-    return np.kron(np.tri(steps), np.eye(n))

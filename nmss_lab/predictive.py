@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,7 +16,15 @@ from typing import Literal
 
 import numpy as np
 
-from nmss_lab.controller import Controller, Limits, Memory, Move, Status
+from nmss_lab.controller import (
+    Controller,
+    Limits,
+    Memory,
+    Move,
+    Status,
+    as_ensemble,
+)
+from nmss_lab.laws import STEPS, Law, Laws
 from nmss_lab.models import Array
 from nmss_lab.nmss import Layout
 from nmss_lab.predict import Affine, Horizon
@@ -41,6 +50,37 @@ class Knowledge:
     from_memory: Array
     from_r: Array
     from_v: Array
+
+
+def _fixed(code: int) -> Array:
+    """Make a number that moves share."""
+    number = np.array(code)
+    number.flags.writeable = False
+    return number
+
+
+FREE, LIMITED, REFUSED = map(_fixed, (Status.FREE, Status.LIMITED, Status.REFUSED))
+NONE = _fixed(0)
+
+
+class Planned(Move):
+    """Move that a law gives; its cost is worked out when somebody asks."""
+
+    __slots__ = ("_cost", "program")
+
+    program: QuadraticProgram
+    _cost: Array | None
+
+    @property
+    def cost(self) -> Array:
+        """Optimal cost J of the sample."""
+        if self._cost is None:
+            self._cost = self.program.cost(self.decision, self.known)
+        return self._cost
+
+    @cost.setter
+    def cost(self, value: Array) -> None:
+        self._cost = value
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,7 +215,7 @@ class PredictiveController(Controller):
     signals: Mapping[str, Affine]
     knowledge: Knowledge
     ranks: Array
-    backend: str = "daqp"
+    backend: str = "active_set"
     forecast: Forecast = "held"
     anti_windup: bool = True
     regions: Regions | None = None
@@ -278,6 +318,113 @@ class PredictiveController(Controller):
         overruled: Array = other | held.any(axis=-1, keepdims=True)
         return overruled
 
+    @property
+    def follows_laws(self) -> bool:
+        """Whether a single loop's move is the affine one of ``laws``."""
+        return True
+
+    @property
+    def in_force(self) -> Affine | None:
+        """Reference in force (n_y rows) as a function of decision and known vector.
+
+        None where it is the r_k of the memory.
+        """
+        return None
+
+    @cached_property
+    def laws(self) -> Laws:
+        """Affine laws of a single loop, see ``nmss_lab.laws``."""
+        # an input left outside by hand comes back as far as the rates reach
+        sides = self.limits_u if np.isfinite(self.limits_du).any() else None
+        return Laws(
+            self.program,
+            self.in_force,
+            self.first_move,
+            self.form.recipe.layout.select("r"),
+            self.knowledge.from_memory,
+            self._from_coming,
+            self.knowledge.layout["u"],
+            sides,
+        )
+
+    @cached_property
+    def _switches(self) -> bool:
+        """Whether a single loop goes from law to law before a solver is asked."""
+        return self.backend == "active_set" and self.ranked.strict
+
+    def decide(
+        self, memory: Memory, r: Array | None = None, v: Array | None = None
+    ) -> Move:
+        """Choose u_k from what has been measured, see ``Controller.decide``.
+
+        A single loop looks at the law of its last move first.
+        """
+        if memory.vector.ndim > 1 or not self.follows_laws:
+            return super().decide(memory, r, v)
+        laws, law = self.laws, memory.law
+        if law is None or law.region.program is not self.program:
+            law = laws.free
+        told = None
+        if r is not None or v is not None or laws.coming is not None:
+            told = self._handed(memory, r, v)
+        last, wrong, tests = law, None, None
+        for _ in range(STEPS):
+            if law is None:
+                break
+            value = law.value(memory.vector, told)
+            tests = value[law.tests]
+            if not tests.size or tests.item(tests.argmin()) > 0.0:
+                return self._planned(law, value, memory, last)
+            wrong, law = law, laws.next(law, tests) if self._switches else None
+        move = super().decide(memory, r, v)
+        if not self._switches or move.status > Status.LIMITED:
+            return move
+        law = laws.of(np.sign(move.multipliers).astype(np.int8))
+        if law is None:
+            return move
+        # answer by the law, as the next time, to the last digit
+        value = law.value(memory.vector, told)
+        if not (value[law.tests] > 0.0).all():
+            return move
+        if wrong is not None and tests is not None:
+            laws.learn(wrong, tests, law)
+        return self._planned(law, value, memory, last)
+
+    @cached_property
+    def _handed_shape(self) -> tuple[int, int] | None:
+        """Shape of r if nothing else is handed to ``decide``."""
+        return None if self.model.n_v else (1 + self.preview, self.model.n_y)
+
+    def _handed(self, memory: Memory, r: Array | None, v: Array | None) -> Array:
+        """Give what ``decide`` is handed in one row, for a single loop."""
+        if type(r) is np.ndarray and r.shape == self._handed_shape:
+            told: Array = r.ravel()
+            if math.isfinite(told.dot(told)):
+                return told
+        given = self._given(as_ensemble(memory), r, v)
+        row: Array = self._coming(memory.vector[None], *given)[0]
+        return row
+
+    def _planned(
+        self, law: Law, value: Array, memory: Memory, last: Law | None
+    ) -> Move:
+        """Move that a law gives, after another one."""
+        w, status = value[law.w], LIMITED if law.limited else FREE
+        move = Planned(
+            value[law.u],
+            w,
+            w,
+            value[law.decision],
+            value[law.known],
+            REFUSED if memory.refused else status,
+            None,  # type: ignore[arg-type]
+            value[law.multipliers],
+            NONE if law is last or last is None else law.changes(last),
+            NONE,
+        )
+        move.program, move.law = self.program, law
+        return move
+
     def _decide(self, memory: Memory, r: Array, v: Array) -> Move:
         theta = self._known(memory.vector, r, v)
         z = theta @ self.program.free.T
@@ -317,16 +464,24 @@ class PredictiveController(Controller):
             move.status[rows] = Status.LIMITED
 
     def _known(self, vector: Array, r: Array, v: Array) -> Array:
-        knows, loops = self.knowledge, len(vector)
-        theta: Array = vector @ knows.from_memory.T
-        if knows.from_r.any():
-            theta += r.reshape(loops, -1) @ knows.from_r.T
-        if knows.from_v.any():
-            asked = _line if self.forecast == "line" else self.forecast
-            if callable(asked):
-                v = self._ask_forecast(asked, vector)
-            theta += v.reshape(loops, -1) @ knows.from_v.T
+        theta: Array = vector @ self.knowledge.from_memory.T
+        if self._from_coming is not None:
+            theta += self._coming(vector, r, v) @ self._from_coming.T
         return theta
+
+    @cached_property
+    def _from_coming(self) -> Array | None:
+        """Gain of theta on what ``decide`` is handed; None where it does not matter."""
+        both = np.hstack([self.knowledge.from_r, self.knowledge.from_v])
+        return both if both.any() else None
+
+    def _coming(self, vector: Array, r: Array, v: Array) -> Array:
+        """Give what ``decide`` is handed, r first, in one row a loop."""
+        loops = len(vector)
+        asked = _line if self.forecast == "line" else self.forecast
+        if callable(asked) and self.knowledge.from_v.any():
+            v = self._ask_forecast(asked, vector)
+        return np.concatenate([r.reshape(loops, -1), v.reshape(loops, -1)], axis=1)
 
     def _ask_forecast(
         self, forecast: Callable[[Array, int], Array], vector: Array

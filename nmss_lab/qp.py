@@ -22,7 +22,7 @@ import numpy as np
 import scipy.linalg
 
 from nmss_lab.models import Array
-from nmss_lab.predict import Affine
+from nmss_lab.predict import Affine, by_step
 
 FEASIBLE = 1e-9
 """A row counts as kept within this distance, relative to 1 + abs(bound)."""
@@ -44,7 +44,10 @@ class Row(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Cost:
-    """Quadratic cost signal' weight signal."""
+    """Quadratic cost signal' weight signal.
+
+    The weight is a matrix (rows, rows), or the blocks (n, size, size) on its diagonal.
+    """
 
     signal: Affine
     weight: Array
@@ -96,24 +99,49 @@ class QuadraticProgram:
         return self.H.shape[0]
 
     @cached_property
+    def _factor(self) -> tuple[Array, bool]:
+        factor: tuple[Array, bool] = scipy.linalg.cho_factor(self.H)
+        return factor
+
+    @cached_property
+    def bare(self) -> Array:
+        """Gain (n_z, n_theta) of the optimum without any rows, -H^-1 f."""
+        bare: Array = -scipy.linalg.cho_solve(self._factor, self.f)
+        return bare
+
+    @cached_property
+    def bare_rows(self) -> Array:
+        """Gain (rows, n_theta) of the rows at the optimum without any."""
+        gain: Array = self.M @ self.bare + self.offset
+        return gain
+
+    @cached_property
     def free(self) -> Array:
-        """Gain (n_z, n_theta) of the optimum without limits, -H^-1 f.
+        """Gain (n_z, n_theta) of the optimum without limits.
 
         Terminal equalities always hold, so the optimum is taken among what meets them,
         unless they are more than the decision can meet.
         """
-        free = -scipy.linalg.cho_solve(scipy.linalg.cho_factor(self.H), self.f)
         equal = self.rows.get("terminal", np.zeros(0, dtype=int))
-        E, e = self.M[equal], self.offset[equal]
+        E = self.M[equal]
         if not 0 < len(E) <= self.n_z or np.linalg.matrix_rank(E) < len(E):
-            return free
-        push = np.linalg.solve(self.H, E.T)
-        return free - push @ np.linalg.solve(E @ push, E @ free + e)
+            return self.bare
+        push = self.push[:, equal]
+        free: Array = self.bare - push @ np.linalg.solve(
+            E @ push, self.bare_rows[equal]
+        )
+        return free
+
+    @cached_property
+    def inverse(self) -> Array:
+        """H^-1, (n_z, n_z)."""
+        inverse: Array = scipy.linalg.cho_solve(self._factor, np.eye(self.n_z))
+        return inverse
 
     @cached_property
     def push(self) -> Array:
         """Change of the free optimum for a unit force in each row, H^-1 M'."""
-        push: Array = scipy.linalg.cho_solve(scipy.linalg.cho_factor(self.H), self.M.T)
+        push: Array = scipy.linalg.cho_solve(self._factor, self.M.T)
         return push
 
     @cached_property
@@ -127,8 +155,8 @@ class QuadraticProgram:
 
     def cost(self, z: Array, theta: Array) -> Array:
         """Full cost J, constant included, for z (..., n_z) and theta (..., n_theta)."""
-        quadratic = _products(z @ self.H + 2.0 * theta @ self.f.T, z)
-        cost: Array = quadratic + _products(theta @ self.constant, theta)
+        quadratic = np.vecdot(z @ self.H + 2.0 * (theta @ self.f.T), z)
+        cost: Array = quadratic + np.vecdot(theta @ self.constant, theta)
         return cost
 
     def room(self, z: Array, theta: Array) -> Array:
@@ -244,7 +272,8 @@ def sum_of_squares(costs: Sequence[Cost]) -> Array:
     total: Array = np.zeros(())
     for cost in costs:
         both = cost.signal.table
-        total = total + both.T @ cost.weight @ both
+        weighed = by_step(cost.weight, both)
+        total = total + both.T @ weighed
     return (total + total.T) / 2.0
 
 
@@ -272,7 +301,15 @@ def matters(limit: Limit) -> tuple[Array, Array]:
 
 
 def weight(name: str, value: Any, steps: int, size: int) -> Array:
-    """Block-diagonal weight (steps size, steps size), symmetric.
+    """Block-diagonal weight (steps size, steps size), see ``weight_blocks``."""
+    full: Array = scipy.linalg.block_diag(*weight_blocks(name, value, steps, size))
+    return full
+
+
+def weight_blocks(name: str, value: Any, steps: int, size: int) -> Array:
+    """Symmetric blocks (steps, size, size) of a block-diagonal weight.
+
+    A full matrix is a single block (1, steps size, steps size).
 
     Accepts a number, one weight a channel (size,), a matrix (size, size), one number a
     step (steps,) for a single channel, one matrix a step (steps, size, size), or the
@@ -287,7 +324,7 @@ def weight(name: str, value: Any, steps: int, size: int) -> Array:
     if not np.isfinite(array).all():
         raise ValueError(f"{name} holds entries that are not finite")
     if array.shape == (steps * size, steps * size) and steps > 1:
-        return (array + array.T) / 2.0
+        return (array + array.T)[None] / 2.0
     if size == 1 and array.shape == (steps,):
         array = array[:, None, None]
     if array.ndim == 0:
@@ -302,8 +339,8 @@ def weight(name: str, value: Any, steps: int, size: int) -> Array:
             f"({size}, {size}), ({steps}, {size}, {size}) or the full "
             f"({steps * size}, {steps * size})"
         )
-    full: Array = scipy.linalg.block_diag(*((step + step.T) / 2.0 for step in array))
-    return full
+    blocks: Array = (array + array.transpose(0, 2, 1)) / 2.0
+    return blocks
 
 
 class QPStatus(enum.Enum):
@@ -390,7 +427,8 @@ def solve(
     program : QuadraticProgram
     theta : array (n_theta,)
     backend : str
-        "daqp", "proxqp", or "qpsolvers/NAME" for any solver qpsolvers finds.
+        "active_set" (see ``BACKENDS``), "daqp", "proxqp", or "qpsolvers/NAME" for any
+        solver qpsolvers finds.
     bounds : pair of arrays (rows,), optional
         Lower and upper limits in place of the program's.
     guess : pair of arrays (at most n_z,), (rows,), optional
@@ -474,12 +512,6 @@ def kkt_residuals(problem: Problem, z: Array, multipliers: Array) -> Array:
 def _largest(columns: Array) -> Array:
     largest: Array = np.abs(columns).max(axis=0, initial=0.0)
     return largest
-
-
-def _products(a: Array, b: Array) -> Array:
-    """Scalar products along the last axis."""
-    products: Array = np.einsum("...i,...i->...", a, b)
-    return products
 
 
 def one_by_one(matrix: Array, vectors: Array) -> Array:
@@ -576,8 +608,15 @@ def _through_qpsolvers(name: str) -> Backend:
     return run
 
 
-BACKENDS: dict[str, Backend] = {"daqp": _daqp, "proxqp": _proxqp}
-"""Solvers by name; adding one is one function ``Problem -> Answer`` and one entry."""
+BACKENDS: dict[str, Backend] = {
+    "active_set": _daqp,
+    "daqp": _daqp,
+    "proxqp": _proxqp,
+}
+"""Solvers by name; adding one is one function ``Problem -> Answer`` and one entry.
+
+With "active_set" a loop goes on from the rows that its last move held, see
+``nmss_lab.laws``; DAQP solves what is left."""
 
 
 def find_backend(name: str) -> Backend:

@@ -8,7 +8,8 @@ convex program are affine in the known vector (explicit predictive control):
           = \begin{bmatrix} -f\theta \\ b_a - offset_a\,\theta \end{bmatrix}
 
 Instead of all regions, of which there are far too many, only those are kept that a
-solver came upon: loops of an ensemble share most of them.
+solver came upon: loops of an ensemble share most of them, and a single loop meets them
+again (``nmss_lab.laws``).
 """
 
 from __future__ import annotations
@@ -36,6 +37,9 @@ PATIENCE = 16
 """Regions in a row that answer nothing until a solver is asked: its answer leads
 straight to the right one."""
 
+ROUNDING = 1e-12
+"""Error of a region up to which its answers need not be looked at one by one."""
+
 Answer = tuple[Array, Array, Array]
 """Numbers of known vectors (found,), decisions (found, n_z), multipliers."""
 
@@ -47,6 +51,8 @@ class Region:
     Parameters
     ----------
     program : QuadraticProgram
+    held : integer array (rows,)
+        1 for rows held by their upper limit, -1 by the lower one, else 0.
     solution : array (n_z + rows, n_theta + 1)
         Decision and multipliers as a map of [theta; 1].
     test : array (tested, n_theta + 1)
@@ -55,15 +61,21 @@ class Region:
         the sign of the side that holds them.
     signed : int
         How many rows of the test are multipliers; they come first.
+    tested, instead : integer arrays (tested,), (tested,)
+        The row of the program that each test is about, and how it is held beyond: let
+        go where its multiplier has the wrong sign, held where its room is used up.
     error : float
-        Largest violation of the equations above for known vectors of size 1, which
-        rounding leaves.
+        Largest violation of the equations above that rounding leaves, relative to the
+        size of their terms.
     """
 
     program: QuadraticProgram
+    held: Array
     solution: Array
     test: Array
     signed: int
+    tested: Array
+    instead: Array
     error: float
 
     def answer(self, theta: Array) -> Answer:
@@ -81,7 +93,7 @@ class Region:
         theta = theta[inside]
         both = one_by_one(self.solution[:, :-1], theta) + self.solution[:, -1]
         z, multipliers = both[:, : self.program.n_z], both[:, self.program.n_z :]
-        if self._certain(theta, multipliers):
+        if self.error <= ROUNDING:
             return inside, z, multipliers
         good = self._residuals(theta, z, multipliers) <= ACCEPTED
         return inside[good], z[good], multipliers[good]
@@ -93,12 +105,6 @@ class Region:
         value[: self.signed] -= HELD * (1.0 + largest)
         holds: Array = np.all(value > 0.0, axis=0)
         return holds
-
-    def _certain(self, theta: Array, multipliers: Array) -> bool:
-        """Whether all residuals are so small that none need be looked at one by one."""
-        violation = self.error * (1.0 + np.abs(theta).max(initial=0.0))
-        gap = violation * (1.0 + np.abs(multipliers).max(initial=0.0))
-        return bool(gap <= 1e-2 * ACCEPTED)
 
     def _residuals(self, theta: Array, z: Array, multipliers: Array) -> Array:
         program, columns = self.program, theta.T
@@ -120,33 +126,83 @@ def region(program: QuadraticProgram, held: Array) -> Region | None:
     """
     equal = program.upper - program.lower < 1e-12
     rows = np.flatnonzero((held != 0.0) | equal)
-    M, n_z, size = program.M[rows], program.n_z, len(rows)
-    if np.linalg.matrix_rank(M) < size:
+    push, M = program.push[:, rows], program.M[rows]
+    moved = M @ push
+    if not _independent(moved):
         return None
     edge = np.where(held > 0.0, program.upper, program.lower)[rows]
-    kkt = np.block([[program.H, M.T], [M, np.zeros((size, size))]])
-    known = np.concatenate([program.f, program.offset[rows]])
-    right = np.column_stack([-known, np.pad(edge, (n_z, 0))])
-    both = np.linalg.solve(kkt, right)
-    error = np.abs(kkt @ both - right).sum(axis=1).max()
-    solution = np.zeros((n_z + len(held), both.shape[1]))
-    solution[:n_z], solution[n_z + rows] = both[:n_z], both[n_z:]
-    one_sided = ~equal[rows]  # multipliers of an equality may have either sign
-    signs = (np.sign(held[rows])[:, None] * both[n_z:])[one_sided]
-    room = _room(program, both[:n_z], np.delete(np.arange(len(held)), rows))
-    test = np.concatenate([signs, room])
-    return Region(program, solution, test, len(signs), float(error))
+    z = _affine(program.bare)
+    forces = np.linalg.solve(moved, _affine(program.bare_rows[rows], -edge))
+    z -= push @ forces
+    known = np.concatenate([_affine(program.f), _affine(program.offset[rows], -edge)])
+    kkt = np.block([[program.H, M.T], [M, np.zeros((len(rows), len(rows)))]])
+    both = np.concatenate([z, forces])
+    error = _error(kkt, both, known)
+    if error > 1e-2 * ROUNDING:  # held rows leave little of what was subtracted
+        left = kkt @ both + known
+        alone = program.inverse @ left[: program.n_z]
+        more = np.linalg.solve(moved, left[program.n_z :] - M @ alone)
+        both -= np.concatenate([alone + push @ more, -more])
+        error = _error(kkt, both, known)
+    z, forces = both[: program.n_z], both[program.n_z :]
+    value = program.M @ z
+    value[:, :-1] += program.offset
+    solution = np.zeros((program.n_z + len(held), z.shape[1]))
+    solution[: program.n_z], solution[program.n_z + rows] = z, forces
+    one_sided = rows[~equal[rows]]  # multipliers of an equality may have either sign
+    signs = np.sign(held).astype(np.int8)
+    signed = signs[one_sided][:, None] * forces[~equal[rows]]
+    room, tested, instead = _room(program, value, np.delete(np.arange(len(held)), rows))
+    return Region(
+        program,
+        signs,
+        solution,
+        np.concatenate([signed, room]),
+        len(signed),
+        np.concatenate([one_sided, tested]),
+        np.concatenate([np.zeros(len(signed), np.int8), instead]),
+        error,
+    )
 
 
-def _room(program: QuadraticProgram, z: Array, rows: Array) -> Array:
-    """Room of rows to their finite limits, less the slack, as a map of [theta; 1]."""
-    value = program.M[rows] @ z
-    value[:, :-1] += program.offset[rows]
-    below, above = value.copy(), -value
-    below[:, -1] -= program.lower[rows] + program.slack[rows]
-    above[:, -1] += program.upper[rows] - program.slack[rows]
-    room: Array = np.concatenate([below, above])
-    return room[np.isfinite(room[:, -1])]
+def _error(kkt: Array, both: Array, known: Array) -> float:
+    """Violation of the equations, relative to the size of their terms."""
+    left = np.abs(kkt @ both + known).sum(axis=1)
+    terms = (np.abs(kkt) @ np.abs(both) + np.abs(known)).sum(axis=1)
+    return float((left / np.where(terms > 0.0, terms, 1.0)).max(initial=0.0))
+
+
+def _independent(pushed: Array) -> bool:
+    """Whether held rows can be moved independently, from what they move each other."""
+    try:
+        alone = np.linalg.cholesky(pushed).diagonal() ** 2
+    except np.linalg.LinAlgError:
+        return False
+    return bool((alone > 1e-10 * pushed.diagonal()).all())
+
+
+def _affine(gain: Array, constant: Array | float = 0.0) -> Array:
+    """Map of [theta; 1]."""
+    full = np.empty((gain.shape[0], gain.shape[1] + 1))
+    full[:, :-1], full[:, -1] = gain, constant
+    return full
+
+
+def _room(
+    program: QuadraticProgram, value: Array, rows: Array
+) -> tuple[Array, Array, Array]:
+    """Room of rows to their finite limits, less the slack, and which limits it is to.
+
+    ``value`` is a map of [theta; 1], as the room is.
+    """
+    slack = program.slack[rows]
+    below, above = value[rows], -value[rows]
+    below[:, -1] -= program.lower[rows] + slack
+    above[:, -1] += program.upper[rows] - slack
+    room = np.concatenate([below, above])
+    sides = np.repeat(np.array([-1, 1], np.int8), len(rows))
+    finite = np.isfinite(room[:, -1])
+    return room[finite], np.tile(rows, 2)[finite], sides[finite]
 
 
 def _without(numbers: Array, places: Array) -> Array:

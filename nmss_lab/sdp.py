@@ -351,6 +351,11 @@ class StateDependentGovernor(PredictiveController):
         """0 when w_k is chosen at k, 1 when w_{k+1} is."""
         return int(not self.causal)
 
+    @property
+    def follows_laws(self) -> bool:
+        """Never: the program is another at each sample."""
+        return False
+
     def free_law(self) -> tuple[Array, Array]:
         """Refuse: the law is not linear."""
         raise ValueError(NOT_LINEAR)

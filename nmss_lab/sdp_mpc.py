@@ -151,6 +151,11 @@ class StateDependentController(PredictiveController):
     problem: Problem = field(kw_only=True)
     offset_free: bool = field(kw_only=True, default=True)
 
+    @property
+    def follows_laws(self) -> bool:
+        """Never: the program is another at each sample."""
+        return False
+
     def free_law(self) -> tuple[Array, Array]:
         """Refuse: the law of a state-dependent plant is not linear."""
         raise ValueError(NOT_LINEAR)

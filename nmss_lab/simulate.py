@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
 
-from nmss_lab.controller import Controller, Memory, Move, Status
+from nmss_lab.controller import Controller, Memory, Move, Status, stacked
 from nmss_lab.models import Array, DifferenceModel, LinearPlant, Numbers, Plant
 from nmss_lab.parallel import in_order
 from nmss_lab.predictive import PredictiveController
@@ -22,6 +22,9 @@ Equation = DifferenceModel | StateDependentModel
 
 TOLD = "w", "status", "cost", "multipliers", "iterations"
 """What every run tells of its moves."""
+
+KEPT = tuple(part.name for part in fields(Move) if part.init)
+"""What there is to tell of moves."""
 
 DIVERGED = 1e9
 """Output beyond which a loop of an ensemble is given up."""
@@ -246,21 +249,7 @@ def samples(
     ValueError
         If plant, controller and scenario do not fit together.
     """
-    for sample in _lock_step(_Single(plant), controller, scenario):
-        move = Move(*(getattr(sample.move, n)[0] for n in Move.__dataclass_fields__))
-        memory = Memory(
-            *(getattr(sample.memory, n)[0] for n in Memory.__dataclass_fields__)
-        )
-        between = None if sample.between is None else sample.between[0]
-        yield Sample(
-            sample.k,
-            sample.y[0],
-            sample.measured[0],
-            sample.u[0],
-            move,
-            memory,
-            between,
-        )
+    yield from _lock_step(_Single(plant), controller, scenario)
 
 
 def closed_loop(
@@ -360,31 +349,26 @@ def _loop_of(task: tuple[Plant | Equation, Controller, Scenario]) -> Run:
 
 
 class _Single:
-    """One plant of any kind as an ensemble of one."""
+    """One plant of any kind; nothing of it has a leading axis."""
+
+    lead: tuple[int, ...] = ()
 
     def __init__(self, model: Plant | Equation) -> None:
         plant: Plant = model.plant() if isinstance(model, Equation) else model
-        self.plant, self.size = plant, 1
-        self.dt, self.n_y = plant.dt, plant.n_y
+        self.plant, self.dt, self.n_y = plant, plant.dt, plant.n_y
         self.n_u, self.n_v = plant.n_u, plant.n_v
-        self.times = _times(plant)
-
-    def reset(self, u0: Array, v0: Array, y0: Array | None) -> Any:
-        return self.plant.reset(u0, v0, y0)
+        self.times, self.reset, self.step = _times(plant), plant.reset, plant.step
 
     def output(self, state: Any) -> Array:
-        return np.asarray(self.plant.output(state), dtype=float)[None]
-
-    def step(self, state: Any, u: Array, v: Array) -> Any:
-        return self.plant.step(state, u[0], v[0])
+        return np.asarray(self.plant.output(state), dtype=float)
 
     def between(self, state: Any, u: Array, v: Array) -> Array | None:
-        """Return outputs (1, m, n_y) between this sample and the next."""
+        """Return outputs (m, n_y) between this sample and the next."""
         if self.times is None:
             return None
         part = self.plant.between  # type: ignore[attr-defined]
-        inside: Array = part.C @ state + part.B @ u[0] + part.G @ v[0]
-        return inside[None]
+        inside: Array = part.C @ state + part.B @ u + part.G @ v
+        return inside
 
 
 class _Stacked:
@@ -395,7 +379,7 @@ class _Stacked:
             raise ValueError("plants is empty, expected at least one LinearPlant")
         plants = [m.plant() if isinstance(m, DifferenceModel) else m for m in models]
         first = plants[0]
-        self.plants, self.size = list(plants), len(plants)
+        self.plants, self.lead = list(plants), (len(plants),)
         self.dt, self.n_y, self.n_u, self.n_v = (
             first.dt,
             first.n_y,
@@ -418,7 +402,7 @@ class _Stacked:
 
     def reset(self, u0: Array, v0: Array, y0: Array | None) -> Array:
         if not (u0.any() or v0.any() or np.any(0.0 if y0 is None else y0)):
-            return np.zeros((self.size, self.n_x))
+            return np.zeros((*self.lead, self.n_x))
         return np.stack([plant.reset(u0, v0, y0) for plant in self.plants])
 
     def output(self, state: Array) -> Array:
@@ -467,49 +451,53 @@ def _lock_step(
     )
     r = scenario.of("reference", model.n_y)
     v = scenario.of("v", plants.n_v)
-    loops_v = np.broadcast_to(v[:, None], (len(v), plants.size, plants.n_v))
+    plants_v = v
+    if plants.lead:
+        plants_v = np.broadcast_to(v[:, None], (len(v), *plants.lead, plants.n_v))
     u0, v0 = _constant(scenario.u0, model.n_u), _constant(scenario.v0, plants.n_v)
     before = None if scenario.y0 is None else _constant(scenario.y0, model.n_y)
     state = plants.reset(u0, v0, before)
     y0 = plants.output(state)
     memory = _start(controller, y0, u0, v0, r[0], scenario.z0)
-    ahead_r = _padded(r, controller.preview)
-    ahead_v = _padded(v, controller.forecast_steps)
-    knows_v = model.n_v > 0
-    u = np.broadcast_to(u0, (plants.size, model.n_u))
-    given_up = np.zeros(plants.size, dtype=bool)
+    # what a controller does not read ahead it holds by itself
+    reads_r, reads_v = controller.preview, controller.forecast_steps
+    ahead_r, ahead_v = _padded(r, reads_r), _padded(v, reads_v)
+    knows_v, by_hand = model.n_v > 0, np.isfinite(manual)
+    u = np.broadcast_to(u0, (*plants.lead, model.n_u))
+    given_up = np.zeros(plants.lead, dtype=bool)
     for k in range(len(scenario)):
         y = plants.output(state) + d_y[k]
         given_up = given_up | _diverged(plants, y, k)
-        if given_up.any():
+        some = bool(given_up.any())
+        if some:
             y[given_up], state[given_up], memory.vector[given_up] = np.nan, 0.0, 0.0
         measured = y + noise[k]
         memory = controller.measure(memory, measured, r[k], v[k] if knows_v else None)
         move = controller.decide(
             memory,
-            ahead_r[k : k + 1 + controller.preview],
-            ahead_v[k : k + 1 + controller.forecast_steps] if knows_v else None,
+            ahead_r[k : k + 1 + reads_r] if reads_r else None,
+            ahead_v[k : k + 1 + reads_v] if knows_v and reads_v else None,
         )
-        wanted = np.where(np.isfinite(manual[k]), manual[k], move.u)
+        wanted = np.where(by_hand[k], manual[k], move.u)
         u_before, u = u, np.clip(wanted, *scenario.actuator)
         into = u + d_u[k]
-        inside = plants.between(state, into, loops_v[k])
-        if given_up.any():
+        inside = plants.between(state, into, plants_v[k])
+        if some:
             u[given_up] = u_before[given_up]
             move.cost[given_up], move.multipliers[given_up] = np.nan, 0.0
         yield Sample(k, y, measured, u, move, memory, inside)
         memory = controller.apply(memory, u, move, into if scenario.seen else None)
-        state = plants.step(state, into, loops_v[k])
+        state = plants.step(state, into, plants_v[k])
 
 
 def _diverged(plants: _Single | _Stacked, y: Array, k: int) -> Array:
     """Which loops are to be given up, (loops,); a single loop raises."""
-    if isinstance(plants, _Stacked):
+    if plants.lead:
         bounded: Array = np.all(np.abs(y) <= DIVERGED, axis=1)
         return ~bounded
     if not np.isfinite(y).all():
         raise ValueError(f"the loop diverged: y is no longer finite at sample {k}")
-    return np.zeros(1, dtype=bool)
+    return np.zeros((), dtype=bool)
 
 
 def _start(
@@ -522,35 +510,33 @@ def _start(
 ) -> Memory:
     """Memories of all loops, stacked; loops that start alike are made once."""
     known_v = v0 if controller.model.n_v else None
+    if y0.ndim == 1:
+        return controller.start(y0, u0, known_v, r0, z0)
     kinds, of_loop = np.unique(y0, axis=0, return_inverse=True)
     starts = [controller.start(y, u0, known_v, r0, z0) for y in kinds]
-    names = Memory.__dataclass_fields__
-    return Memory(
-        *(
-            np.stack([getattr(m, name) for m in starts])[of_loop.ravel()]
-            for name in names
-        )
-    )
+    return stacked(starts, of_loop.ravel())
 
 
 class _Log:
-    """What happens to all loops, written sample by sample, time first."""
+    """What happens, written sample by sample, time first."""
 
     def __init__(self, samples: int) -> None:
         self.samples = samples
         self.arrays: dict[str, Array] = {}
 
     def write(self, k: int, **values: Array) -> None:
-        """Note the values (loops, ...) of sample k."""
+        """Note the values of sample k; those of many loops have a leading axis."""
         for name, value in values.items():
             if name not in self.arrays:
                 shape = self.samples, *value.shape
                 self.arrays[name] = np.zeros(shape, value.dtype)
-            if value.any():  # pages of zeros take neither time nor memory
+            if value.size < 64 or value.any():  # large zeros take no memory
                 self.arrays[name][k] = value
 
-    def of(self, i: int) -> dict[str, Array]:
-        """Values (samples, ...) of loop i."""
+    def of(self, i: int | None) -> dict[str, Array]:
+        """Values (samples, ...) of loop i of many, or of the only one (None)."""
+        if i is None:
+            return self.arrays
         return {name: values[:, i] for name, values in self.arrays.items()}
 
 
@@ -561,15 +547,14 @@ def _collect(
     keep_moves: bool,
 ) -> list[Run]:
     N = len(scenario)
-    log, moves = _Log(N), _Log(N)
-    deciding = controller.together() if isinstance(plants, _Stacked) else controller
+    log, told = _Log(N), _Log(N)
+    names = KEPT if keep_moves else TOLD
+    deciding = controller.together() if plants.lead else controller
     for sample in _lock_step(plants, deciding, scenario):
         log.write(sample.k, y=sample.y, measured=sample.measured, u=sample.u)
-        log.write(sample.k, **{name: getattr(sample.move, name) for name in TOLD})
+        told.write(sample.k, **{name: getattr(sample.move, name) for name in names})
         if sample.between is not None:
             log.write(sample.k, y_fine=sample.between)
-        if keep_moves:
-            moves.write(sample.k, **vars(sample.move))
     u, before = log.arrays["u"], _constant(scenario.u0, controller.model.n_u)
     before = np.broadcast_to(before, (1, *u.shape[1:]))
     log.arrays["du"] = np.diff(u, axis=0, prepend=before)
@@ -582,10 +567,11 @@ def _collect(
             r=scenario.reference,
             v=scenario.of("v", plants.n_v),
             t_fine=t_fine,
-            moves=Move(**moves.of(i)) if keep_moves else None,
+            moves=Move(**told.of(i)) if keep_moves else None,
+            **{name: told.of(i)[name] for name in TOLD},
             **log.of(i),
         )
-        for i in range(plants.size)
+        for i in (range(*plants.lead) if plants.lead else [None])
     ]
 
 
@@ -598,7 +584,8 @@ def _fine(
         return t, y
     d_y = scenario.of("output_disturbance", plants.n_y)
     given_up = np.isnan(y)
-    blocks = np.moveaxis(log.arrays["y_fine"], 2, 1) + d_y[:, None, None]
+    alike = tuple(range(1, 2 + len(plants.lead)))
+    blocks = np.moveaxis(log.arrays["y_fine"], -2, 1) + np.expand_dims(d_y, alike)
     blocks = np.where(given_up[:, None], np.nan, blocks)
     fine = np.concatenate([y[:1], blocks.reshape(-1, *y.shape[1:])])
     fine[: -1 : len(plants.times)][given_up] = np.nan

@@ -24,6 +24,7 @@ ORDER = [
     "predict",
     "qp",
     "regions",
+    "laws",
     "controller",
     "pip",
     "predictive",

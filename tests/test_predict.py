@@ -4,6 +4,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+import scipy.linalg
 from conftest import ALGEBRA
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -20,6 +21,7 @@ from strategies import (
     roll_out_changes,
 )
 
+from nmss_lab import predict as prediction
 from nmss_lab.controller import Limits
 from nmss_lab.governor import governor
 from nmss_lab.mpc import (
@@ -34,9 +36,9 @@ from nmss_lab.pip import lq_gain
 from nmss_lab.predict import (
     Affine,
     Horizon,
-    cumulate,
+    at_each_step,
+    by_step,
     decided,
-    difference,
     known_part,
     predict,
     stack,
@@ -345,10 +347,25 @@ def test_impossible_horizons_are_refused(arguments, message):
         Horizon(*arguments)
 
 
-def test_sums_undo_differences():
+def test_sums_undo_differences(rng):
     """C_2 of section 7.3 is the inverse of C_2 of (3.10)."""
-    product = cumulate(4, 3) @ difference(4, 3)
-    assert relative(product, np.eye(12)) <= ALGEBRA
+    signal = Affine(rng.standard_normal((12, 5)), rng.standard_normal((12, 2)))
+    again = prediction.sums(prediction.changes(signal, 3), 3)
+    assert relative(again.table, signal.table) <= ALGEBRA
+    each = prediction.changes(signal, 3).gain
+    assert np.array_equal(each[:3], signal.gain[:3])
+    assert np.array_equal(each[6:9], signal.gain[6:9] - signal.gain[3:6])
+
+
+def test_each_step_is_multiplied_by_itself(rng):
+    """As by a block-diagonal matrix, with one block for all steps or one for each."""
+    signal = Affine(rng.standard_normal((12, 5)), rng.standard_normal((12, 2)))
+    C = rng.standard_normal((2, 3))
+    wanted = np.kron(np.eye(4), C) @ signal
+    assert relative(at_each_step(C, signal).table, wanted.table) <= ALGEBRA
+    each = rng.standard_normal((4, 2, 3))
+    wanted = scipy.linalg.block_diag(*each) @ signal.gain
+    assert relative(by_step(each, signal.gain), wanted) <= ALGEBRA
 
 
 @pytest.mark.parametrize("sizes", SIZES, ids=str)

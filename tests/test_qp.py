@@ -236,7 +236,9 @@ def test_indefinite_sum_is_refused_with_its_eigenvalue():
 
 def test_unknown_solver_is_refused_with_the_known_ones():
     """The message lists what there is."""
-    with pytest.raises(ValueError, match=r'backend = "magic": expected one of daqp'):
+    with pytest.raises(
+        ValueError, match=r'backend = "magic": expected one of active_set, daqp'
+    ):
         qp.find_backend("magic")
     with pytest.raises(ValueError, match="qpsolvers/magic"):
         qp.find_backend("qpsolvers/magic")

@@ -14,7 +14,7 @@ import numpy as np
 
 from nmss_lab.models import Array, DifferenceModel
 from nmss_lab.nmss import Layout, integral_of_error_form
-from nmss_lab.predict import Affine, Horizon, blocks, cumulate, known_part, predict
+from nmss_lab.predict import Affine, Horizon, blocks, known_part, predict
 from nmss_lab.reproduce.rows import Claim, claim
 
 NP, NC, SIZE = 7, 3, 4
@@ -71,7 +71,7 @@ def levels(constant: bool = False) -> Affine:
 @functools.cache
 def increments(constant: bool = False) -> Affine:
     """Forward run under decided changes of the input (8.4)."""
-    moves = cumulate(NP, 1) @ Horizon(NP, NC).impulses(1)
+    moves = Horizon(NP, NC).impulses(1).cumsum(axis=0)
     return drawn(constant).forward(moves, np.ones((NP, 1)))
 
 
