@@ -13,7 +13,7 @@ READY := $(VENV)/.ready
 export OPENBLAS_NUM_THREADS ?= 1
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: serve test lint lab lessons clean
+.PHONY: serve test lint lab lessons bench clean
 
 serve: $(READY)
 	@$(BIN)/nmss-lab serve --port $(PORT)
@@ -35,6 +35,10 @@ lab: $(READY)
 # The executed lessons as pages for any browser, without network or server.
 lessons: $(READY)
 	$(BIN)/python docs/site/build.py --workers $(WORKERS) --out build/lessons
+
+# Times beside a baseline of the same run, written to benchmarks/RESULTS.md.
+bench: $(READY)
+	$(BIN)/nmss-lab bench
 
 # The stamp is younger than what it was made from: a second run installs nothing.
 # The package is installed in place, so that edits need no installation either.

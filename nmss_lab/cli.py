@@ -13,6 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from nmss_lab import __version__
+from nmss_lab.cli_bench import add_bench
 from nmss_lab.cli_serve import add_serve
 from nmss_lab.cli_studies import (
     add_report,
@@ -69,6 +70,7 @@ def _parser() -> argparse.ArgumentParser:
     add_study(commands)
     add_tune(commands)
     add_report(commands)
+    add_bench(commands)
     return parser
 
 

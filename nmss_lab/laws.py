@@ -10,6 +10,8 @@ step of Hintermüller, Ito and Kunisch, SIAM J. Optim. 13, 2003).
 
 from __future__ import annotations
 
+import importlib
+import threading
 from typing import Any
 
 import numpy as np
@@ -25,8 +27,8 @@ MOST, ROOM = 256, 2**24
 INPUTS = "u", "du"
 """Rows that limit the input and its change."""
 
-STEPS = 8
-"""Laws that are looked at until a solver is asked."""
+LOOKS = 3
+"""Known laws that are looked at until a solver is asked."""
 
 
 class Law:
@@ -107,6 +109,46 @@ class Law:
         return value
 
 
+class Solver:
+    """DAQP with the program of a design, asked which rows are held.
+
+    It starts from its last solution; the answer's numbers are left to the law.
+    """
+
+    def __init__(self, program: QuadraticProgram, equal: Array) -> None:
+        self.program, self.equal = program, equal
+        self.upper = np.minimum(program.upper, 1e30)
+        self.lower = np.maximum(program.lower, -1e30)
+        self._lock = threading.Lock()  # a design serves many loops at once
+        self._model = importlib.import_module("daqp").Model()
+        self._told = (  # the model refers to them
+            program.H.copy(),
+            np.zeros(program.n_z),
+            np.ascontiguousarray(program.M),
+            self.upper.copy(),
+            self.lower.copy(),
+            np.where(equal, 5, 0).astype(np.int32),
+        )
+        self._model.setup(*self._told)
+        self._model.settings = {"primal_tol": 1e-10, "dual_tol": 1e-12}
+
+    def held(self, theta: Array) -> Array | None:
+        """Sides that hold rows, as ``Region.held``; None if there is no solution."""
+        f, known = self.program.f.dot(theta), self.program.offset.dot(theta)
+        low, high = self.lower - known, self.upper - known
+        with self._lock:
+            self._model.update(None, f, None, high, low, None)
+            _, _, flag, info = self._model.solve()
+        if flag <= 0:
+            return None
+        multipliers = info["lam"]
+        multipliers[self.equal] = 0.0  # held in any case
+        least = HELD * (1.0 + np.abs(multipliers).max())
+        held: Array = (multipliers > least).astype(np.int8)
+        held[multipliers < -least] = -1
+        return held
+
+
 class Laws:
     """Laws of one design, made when a loop first needs them and kept.
 
@@ -141,9 +183,10 @@ class Laws:
         self.program, self.w, self.u, self.r_k = program, w, u, r_k
         self.knows, self.coming, self.before = knows, coming, before
         self.sides = sides
-        equal = np.flatnonzero(program.upper - program.lower < 1e-12)
-        self._pinned = any(program.labels[i].name != "terminal" for i in equal)
-        labels = program.labels
+        labels, self._equal = program.labels, program.upper - program.lower < 1e-12
+        pinned = np.flatnonzero(self._equal)
+        self._pinned = any(labels[i].name != "terminal" for i in pinned)
+        self._solver: Solver | None = None
         now = np.array([row.step == 0 and row.name in INPUTS for row in labels], bool)
         self._planned = np.where(now, 0.0, program.slack)
         self._kept: dict[bytes, Law | None] = {}
@@ -179,10 +222,10 @@ class Laws:
         return law
 
     def next(self, law: Law, tests: Array) -> Law | None:
-        """Law to look at when the tests of one are not all positive.
+        """Known law to look at when the tests of one are not all positive.
 
         The one that was right the last time the same tests failed, or that of the
-        active-set step if it is known; None where it takes a solver to tell.
+        active-set step.
         """
         passed = tests > 0.0
         known = law.after.get(passed.tobytes())
@@ -198,8 +241,18 @@ class Laws:
             self.learn(law, tests, other)
         return other
 
+    def asked(self, theta: Array) -> Law | None:
+        """Law of the rows that a solver holds; None where there is no such law."""
+        try:
+            if self._solver is None:
+                self._solver = Solver(self.program, self._equal)
+            held = self._solver.held(theta)
+        except Exception:  # the loop goes on, and asks once more where it is told
+            return None
+        return None if held is None else self.of(held)
+
     def learn(self, law: Law, tests: Array, right: Law) -> None:
-        """Note which law was right when the tests of another failed."""
+        """Note which law to look at when the tests of another failed."""
         if len(law.after) >= MOST:
             law.after.clear()
         law.after[(tests > 0.0).tobytes()] = right
@@ -241,11 +294,11 @@ class Laws:
 
     def _first_move(self, found: Region, u: Array) -> Array:
         """u_k as a map of [theta; 1], exactly on a limit that holds it."""
-        for row in np.flatnonzero(found.held).tolist():
+        for row in np.flatnonzero((found.held != 0) | self._equal).tolist():
             name, channel, step = self.program.labels[row]
             if step == 0 and name in INPUTS:
-                upper = found.held[row] > 0
-                side = self.program.upper if upper else self.program.lower
+                lower = found.held[row] < 0
+                side = self.program.lower if lower else self.program.upper
                 u[channel] = 0.0
                 u[channel, -1] = side[row]
                 if name == "du":

@@ -24,7 +24,7 @@ from nmss_lab.controller import (
     Status,
     as_ensemble,
 )
-from nmss_lab.laws import STEPS, Law, Laws
+from nmss_lab.laws import LOOKS, Law, Laws
 from nmss_lab.models import Array
 from nmss_lab.nmss import Layout
 from nmss_lab.predict import Affine, Horizon
@@ -367,28 +367,21 @@ class PredictiveController(Controller):
         told = None
         if r is not None or v is not None or laws.coming is not None:
             told = self._handed(memory, r, v)
-        last, wrong, tests = law, None, None
-        for _ in range(STEPS):
-            if law is None:
-                break
+        last, looks = law, LOOKS if self._switches else 0
+        while law is not None:
             value = law.value(memory.vector, told)
             tests = value[law.tests]
             if not tests.size or tests.item(tests.argmin()) > 0.0:
                 return self._planned(law, value, memory, last)
-            wrong, law = law, laws.next(law, tests) if self._switches else None
-        move = super().decide(memory, r, v)
-        if not self._switches or move.status > Status.LIMITED:
-            return move
-        law = laws.of(np.sign(move.multipliers).astype(np.int8))
-        if law is None:
-            return move
-        # answer by the law, as the next time, to the last digit
-        value = law.value(memory.vector, told)
-        if not (value[law.tests] > 0.0).all():
-            return move
-        if wrong is not None and tests is not None:
-            laws.learn(wrong, tests, law)
-        return self._planned(law, value, memory, last)
+            if looks < 0 or not self._switches:
+                break
+            looks, wrong = looks - 1, law
+            law = laws.next(wrong, tests) if looks > 0 else None
+            if law is None:  # no known one: ask, and look once more
+                looks, law = -1, laws.asked(value[wrong.known])
+                if law is not None:
+                    laws.learn(wrong, tests, law)
+        return super().decide(memory, r, v)
 
     @cached_property
     def _handed_shape(self) -> tuple[int, int] | None:

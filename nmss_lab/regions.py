@@ -138,7 +138,7 @@ def region(program: QuadraticProgram, held: Array) -> Region | None:
     kkt = np.block([[program.H, M.T], [M, np.zeros((len(rows), len(rows)))]])
     both = np.concatenate([z, forces])
     error = _error(kkt, both, known)
-    if error > 1e-2 * ROUNDING:  # held rows leave little of what was subtracted
+    if error > 1e-1 * ROUNDING:  # held rows leave little of what was subtracted
         left = kkt @ both + known
         alone = program.inverse @ left[: program.n_z]
         more = np.linalg.solve(moved, left[program.n_z :] - M @ alone)

@@ -51,6 +51,7 @@ ORDER = [
     "plots",
     "svg",
     "report",
+    "cli_bench",
     "cli_serve",
     "cli_studies",
     "cli",

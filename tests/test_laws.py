@@ -10,7 +10,7 @@ from nmss_lab import qp
 from nmss_lab.cases import CASES, case, square_wave
 from nmss_lab.controller import Limits, Status
 from nmss_lab.governor import governor
-from nmss_lab.laws import Laws
+from nmss_lab.laws import Laws, Solver
 from nmss_lab.models import DifferenceModel
 from nmss_lab.mpc import integral_of_error, wang_young
 from nmss_lab.pip import pole_gain
@@ -33,15 +33,15 @@ def built(limits=TIGHT, **more):
 
 @pytest.fixture
 def asked(monkeypatch):
-    """Programs that DAQP was asked to solve."""
-    problems = []
+    """Known vectors for which a solver was asked."""
+    vectors = []
 
-    def counting(problem, solver=qp.BACKENDS["active_set"]):
-        problems.append(problem)
-        return solver(problem)
+    def counting(self, theta, ask=Solver.held):
+        vectors.append(theta)
+        return ask(self, theta)
 
-    monkeypatch.setitem(qp.BACKENDS, "active_set", counting)
-    return problems
+    monkeypatch.setattr(Solver, "held", counting)
+    return vectors
 
 
 def by_laws(controller):
