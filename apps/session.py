@@ -7,8 +7,9 @@ made from the same lines: what the page shows is what its script prints.
 from __future__ import annotations
 
 import functools
+import itertools
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 from urllib.parse import parse_qsl, urlencode
@@ -37,9 +38,14 @@ from nmss_lab.simulate import Run, Scenario, closed_loop
 from nmss_lab.state_dependent import StateDependentModel
 
 DIVERGED = 1e9
-"""Outputs beyond this are not drawn: the loop is unstable."""
+"""Outputs and inputs beyond this are not drawn: the loop is unstable."""
 
 MOST_RUNS = 3
+
+MOST_DECIDED = 3.3e9
+"""Samples, times the cube of what the program of each decides: some ten seconds."""
+
+GOVERNORS = "governor", "sdp_governor"
 
 HELD = "A", "B"
 """Choices that hold a design from page to page: each the address that makes it."""
@@ -181,8 +187,8 @@ class Form(param.Parameterized):
         for key in sorted(given, key=lambda key: key not in HELD):
             try:
                 setattr(self, key, self._read(key, values[key]))
-            except (ValueError, TypeError) as error:
-                wrong = wrong or f"{key} = {values[key]!r}: {_short(error)}"
+            except (ValueError, TypeError, OverflowError) as error:
+                wrong = wrong or f"{key} = {values[key]!r:.80}: {_short(error):.400}"
         if wrong:
             raise ValueError(wrong)
 
@@ -363,6 +369,8 @@ class Choices(Holding):
     }
     groups: ClassVar[dict[str, tuple[str, ...]]] = {}
     default_case: ClassVar[str] = ""
+    hears: Callable[[float], None] | None = None
+    """Hears which share of an answer is done, and may end it by raising."""
     makes: ClassVar[str] = ""
     """Page whose address makes the designs of these choices."""
     of_design: ClassVar[tuple[str, ...]] = ()
@@ -648,26 +656,30 @@ class Choices(Holding):
         ValueError
             If a design cannot be built, or its loop diverges; says which and why.
         """
-        plant, scenario = self.plant(), self.scenario()
+        plant, scenario, designs = self.plant(), self.scenario(), self.designs()
+        afford(designs, len(scenario))
+        if self.hears is not None:
+            hears, count = self.hears, itertools.count(1)
+            total = len(designs) * len(scenario)
+            plant = Attended(plant, lambda: hears(next(count) / total))
         return {
             name: self._run(name, design, plant, scenario)
-            for name, design in self.designs().items()
+            for name, design in designs.items()
         }
 
-    def _run(
-        self, name: str, design: Design, plant: LinearPlant, scenario: Scenario
-    ) -> Run:
+    def _run(self, name: str, design: Design, plant: Any, scenario: Scenario) -> Run:
         try:
             controller = design.build()
             with np.errstate(all="ignore"):
                 run = closed_loop(plant, controller, scenario)
         except (ValueError, np.linalg.LinAlgError) as error:
             raise ValueError(f"{plain(name)}: {error}") from error
-        if not np.abs(run.y).max() < DIVERGED:
-            raise ValueError(
-                f"{plain(name)}: the loop is unstable, its output grows beyond "
-                f"{DIVERGED:g}. Try the plant nearer to the model, or wider limits."
-            )
+        for what, signal in (("output", run.y), ("input", run.u)):
+            if not np.abs(signal).max() < DIVERGED:
+                raise ValueError(
+                    f"{plain(name)}: the loop is unstable, its {what} grows beyond "
+                    f"{DIVERGED:g}. Try the plant nearer to the model, or wider limits."
+                )
         return run
 
     def script(self) -> str:
@@ -859,6 +871,74 @@ class AsItIs(Choices):
 
     def _changed_lines(self) -> list[str]:
         return ["    designs[name] = design"]
+
+
+class Attended:
+    """A plant of which somebody hears at each sample, who may end the loop."""
+
+    def __init__(self, plant: Any, hears: Callable[[], None]) -> None:
+        self._plant, self._hears = plant, hears
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._plant, name)
+
+    def step(self, state: Any, u: Any, v: Any) -> Any:
+        """Past one sample later."""
+        self._hears()
+        return self._plant.step(state, u, v)
+
+
+def afford(designs: Mapping[str, Design], samples: int) -> None:
+    """Refuse runs that would take more than some ten seconds.
+
+    Raises
+    ------
+    ValueError
+        Saying by how much, and what to lower.
+    """
+
+    def share(design: Design, Np: int) -> float:
+        return samples * _decided(design, Np) ** 3 / MOST_DECIDED
+
+    shares = {name: share(d, d.horizon.Np) for name, d in designs.items()}
+    times = sum(shares.values())
+    if times <= 1.0:
+        return
+    dearest = designs[max(shares, key=lambda name: shares[name])]
+    others = times - share(dearest, dearest.horizon.Np)
+    advice = [
+        f"lower Np to {Np}"
+        for Np in range(1, dearest.horizon.Np)
+        if share(dearest, Np) + others <= 1.0
+    ][-1:]
+    if len([each for each in shares.values() if each]) > 1:
+        advice.append("choose fewer structures")
+    if _may_give_way(dearest):
+        advice.append("switch off the limits on y")
+    raise ValueError(
+        f"{samples} samples with these horizons take {times:.1f} times as long as an "
+        f"answer may: {', or '.join(advice) or 'open a shorter scenario'}"
+    )
+
+
+def _decided(design: Design, Np: int) -> int:
+    """Count what the largest program of a sample decides, with another horizon."""
+    model, free = _sizes(design.model), min(design.horizon.Nc, Np)
+    if design.structure in GOVERNORS:
+        moves = min(design.options.get("free_until") or Np, free) * model.n_y
+    elif design.structure in STRUCTURES:
+        moves = free * model.n_u
+    else:
+        return 0
+    return moves + _may_give_way(design) * Np * model.n_y
+
+
+def _may_give_way(design: Design) -> bool:
+    """Whether output limits have slack variables where they cannot be kept."""
+    low, high = design.limits.of("y", _sizes(design.model).n_y)
+    limited = bool(np.isfinite(low).any() or np.isfinite(high).any())
+    soft = design.structure in GOVERNORS or design.limits.outputs != "hard"
+    return limited and soft
 
 
 class DesignChoices(Choices):

@@ -154,7 +154,7 @@ def growth(rounds: int, quick: bool, say: Callable[[str], None]) -> Iterator[Fig
             sizes.append(float(size))
             ours.append(taken["ours"])
             plain.append(taken["plain"])
-        half = len(sizes) // 2
+        half = min(len(sizes) // 2, len(sizes) - 2)
         mine, theirs = exponent(sizes, ours, half), exponent(sizes, plain, half)
         yield Figure(
             PART,

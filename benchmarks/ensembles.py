@@ -5,40 +5,38 @@ predictive control with |u| <= 5 on plants drawn within stress level 2, in the s
 process and in turns, with one thread; processor time counts.  The loop is what one
 writes with a solver at hand: the matrices are condensed once, the vectors are built at
 every sample, and ``qpsolvers.solve_qp`` is called for each.  It is timed for every
-solver installed, on the first plants only, as each takes the same time.
+solver installed, on the first plants only, as each takes the same time.  That all find
+the same inputs and outputs is checked.
 """
+
+from __future__ import annotations
 
 import os
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+import contextlib
 import dataclasses
-import platform
 import time
-from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable, Iterator
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import qpsolvers
+from frame import Figure, compared, in_turns, show
 
-import nmss_lab
 from nmss_lab.cases import STRESS_LEVELS, case, ifac93_plant, square_wave
 from nmss_lab.controller import Status
 from nmss_lab.models import LinearPlant
-from nmss_lab.parallel import each
+from nmss_lab.parallel import each, executor_for
 from nmss_lab.predictive import PredictiveController
 from nmss_lab.simulate import Run, Scenario, closed_loops
 
-REALISATIONS, SAMPLES, LEVEL = 1000, 200, 2
-PLAIN = 20
-"""Realisations on which the plain loops are timed and compared."""
-
-REPEATS = 5
-CHUNK = 250
-"""Realisations of one task of a worker process."""
+PART = "Ensembles"
+SAMPLES, LEVEL = 200, 2
+SAME = 1e-8
+"""Largest difference in u and y."""
 
 NOMINAL = {"T1": 5.0, "T2": 0.4, "w0": 5.0, "zeta": 0.3, "K": 1.0}
 TOLERANCES: dict[str, dict[str, float]] = {
@@ -51,15 +49,15 @@ like quadprog an active-set method, takes no longer for it."""
 Trajectories = tuple[np.ndarray, np.ndarray]
 
 
-def plants(seed: int) -> list[LinearPlant]:
-    """Draw a chunk of sampled plants, uniform within the stress level."""
+def plants(seed: int, size: int) -> list[LinearPlant]:
+    """Draw sampled plants, uniform within the stress level."""
     rng = np.random.default_rng([1993, seed])
     spans = STRESS_LEVELS[LEVEL].items()
     return [
         ifac93_plant(
             **{name: NOMINAL[name] + rng.uniform(-span, span) for name, span in spans}
         ).sampled(0.5)
-        for _ in range(CHUNK)
+        for _ in range(size)
     ]
 
 
@@ -98,39 +96,18 @@ def plain_loop(
     return us, ys
 
 
-def fastest(
-    tasks: dict[str, Callable[[], Any]], clock: Callable[[], float]
-) -> tuple[dict[str, float], dict[str, Any]]:
-    """Seconds of each task, the fewest of all rounds, and what it returned."""
-    times, results = dict.fromkeys(tasks, np.inf), {}
-    for _ in range(REPEATS):
-        for name, task in tasks.items():
-            begin = clock()
-            results[name] = task()
-            times[name] = min(times[name], clock() - begin)
-    return times, results
-
-
-def difference(runs: list[Run], others: list[Trajectories]) -> tuple[float, float]:
-    """Largest difference in u and in y."""
-    pairs = list(zip(runs, others, strict=True))
-    return (
-        max(np.abs(run.u[:, 0] - u).max() for run, (u, _) in pairs),
-        max(np.abs(run.y[:, 0] - y).max() for run, (_, y) in pairs),
+def difference(runs: list[Run], others: list[Trajectories]) -> float:
+    """Largest difference in u and y."""
+    return max(
+        np.abs([run.u[:, 0] - u, run.y[:, 0] - y]).max()
+        for run, (u, y) in zip(runs, others, strict=True)
     )
-
-
-def shares(runs: list[Run]) -> tuple[float, int]:
-    """Share of samples at which a limit held, and programs solved for them."""
-    limited = np.mean([run.status == Status.LIMITED for run in runs])
-    solved = sum(int((run.iterations > 0).sum()) for run in runs)
-    return float(limited), solved
 
 
 def plain_loops(
     drawn: list[LinearPlant], built: PredictiveController
 ) -> dict[str, Callable[[], list[Trajectories]]]:
-    """Plain loops on the first plants, by solver."""
+    """Plain loops on all plants, by solver."""
     r = square_wave(SAMPLES, 20)[:, 0].tolist()
     loops = {
         name: partial(
@@ -139,84 +116,103 @@ def plain_loops(
         for name in qpsolvers.available_solvers
     }
     return {
-        name: lambda loop=loop: [loop(plant) for plant in drawn[:PLAIN]]
+        name: lambda loop=loop: [loop(plant) for plant in drawn]
         for name, loop in loops.items()
     }
 
 
-def compare(drawn: list[LinearPlant], reading: str) -> None:
-    """Print all times for a reading of the reference."""
+def compare(
+    reading: str, realisations: int, plain: int, rounds: int
+) -> Iterator[Figure]:
+    """Yield the time of a realisation beside every loop over programs.
+
+    Raises
+    ------
+    RuntimeError
+        If results differ by more than ``SAME``.
+    """
+    drawn = plants(0, realisations)
     built, scenario = controller(reading), Scenario(square_wave(SAMPLES, 20))
-    plain = plain_loops(drawn, built)
-    ensemble = {"closed_loops": lambda: closed_loops(drawn, built, scenario)}
-    times, results = fastest({**ensemble, **plain}, time.process_time)
-    runs = results["closed_loops"]
-    limited, solved = shares(runs)
-    rate = len(drawn) / times["closed_loops"]
-    print(f'reading "{reading}": a limit held at {limited:.1%} of the samples')
-    print(f"  closed_loops {rate:9.0f} realisations/s, {solved} programs solved in all")
-    for name in plain:
-        in_u, in_y = difference(runs[:PLAIN], results[name])
-        print(
-            f"  {name:12} {PLAIN / times[name]:9.0f} realisations/s, "
-            f"{rate * times[name] / PLAIN:6.1f} times as long; differs by {in_u:.1e} "
-            f"in u, {in_y:.1e} in y"
+    loops = plain_loops(drawn[:plain], built)
+    ensemble = {"ours": lambda: closed_loops(drawn, built, scenario)}
+    times, results = in_turns(ensemble | loops, rounds, time.process_time)
+    runs = results["ours"]
+    for name in loops:
+        apart = difference(runs[:plain], results[name])
+        if not apart <= SAME:
+            raise RuntimeError(f"closed_loops and the loop with {name}: {apart} apart")
+    limited = np.mean([run.status == Status.LIMITED for run in runs])
+    solved = sum(int((run.iterations > 0).sum()) for run in runs)
+    best = min(loops, key=lambda name: float(np.median(times[name])))
+    for name in loops:
+        target = {"target": "at most 1/20", "bound": 0.05} if name == best else {}
+        yield compared(
+            PART,
+            f'a realisation, reading "{reading}"',
+            f"IFAC'93, {SAMPLES} samples, {realisations} plants of stress level "
+            f"{LEVEL}; {rounds} times",
+            1e3 * np.array(times["ours"]) / realisations,
+            f"loop over qpsolvers, {name}, {plain} plants",
+            1e3 * np.array(times[name]) / plain,
+            unit="ms of processor time",
+            note=f"a limit held at {limited:.1%} of the samples, {solved} programs "
+            "solved in all",
+            **target,
         )
-        if not max(in_u, in_y) < 1e-8:
-            raise SystemExit(f"closed_loops and the loop with {name} differ")
 
 
-def draw_and_run(seed: int) -> Trajectories:
-    """Run the task of a worker process: draw a chunk and run it."""
+def draw_and_run(task: tuple[int, int]) -> Trajectories:
+    """Draw a chunk of plants, by seed and size, and run it."""
     scenario = Scenario(square_wave(SAMPLES, 20))
-    runs = closed_loops(plants(seed), controller("held"), scenario)
+    runs = closed_loops(plants(*task), controller("held"), scenario)
     return np.array([run.u for run in runs]), np.array([run.y for run in runs])
 
 
-def scale() -> None:
-    """Print times with worker processes."""
-    seeds = range(16)
-    with ProcessPoolExecutor(1) as one, ProcessPoolExecutor(2) as two:
-        tasks = {
-            name: lambda pool=pool: dict(each(draw_and_run, seeds, pool))
-            for name, pool in (("one", one), ("two", two))
+def growth(chunks: int, size: int, rounds: int) -> Iterator[Figure]:
+    """Yield the time with worker processes beside that without.
+
+    Raises
+    ------
+    RuntimeError
+        If the numbers depend on where they were computed.
+    """
+    tasks = [(seed, size) for seed in range(chunks)]
+    counts = [count for count in (1, 2, 4) if count <= max(os.cpu_count() or 1, 2)]
+    with contextlib.ExitStack() as stack:
+        pools = {n: stack.enter_context(executor_for(n)) for n in counts}
+        works = {
+            str(n): lambda pool=pool: dict(each(draw_and_run, tasks, pool))
+            for n, pool in pools.items()
         }
-        times, found = fastest(tasks, time.perf_counter)
-    for name, seconds in times.items():
-        print(f"  in {name}: {len(seeds) * CHUNK / seconds:6.0f} realisations/s")
-    same = all(np.array_equal(found["one"][i], found["two"][i]) for i in seeds)
-    print(
-        f"  {times['one'] / times['two']:.2f} times as fast in two; the numbers are "
-        f"{'the same' if same else 'NOT THE SAME'}"
-    )
+        for work in works.values():
+            work()  # starts the processes
+        times, found = in_turns(works, rounds)
+    for name in list(works)[1:]:
+        if not all(np.array_equal(found["1"][i], found[name][i]) for i in found["1"]):
+            raise RuntimeError(f"in {name} processes the numbers are not the same")
+        yield compared(
+            PART,
+            f"an ensemble in {name} processes, drawing and sampling included",
+            f"IFAC'93, {SAMPLES} samples, {chunks} chunks of {size} plants; "
+            f"{rounds} times",
+            times[name],
+            "the same in one process",
+            times["1"],
+            unit="s",
+            target=f"ideally {1 / int(name):g}",
+        )
 
 
-def processor() -> str:
-    """Name of the processor."""
-    info = Path("/proc/cpuinfo")
-    lines = info.read_text(encoding="utf-8").splitlines() if info.exists() else []
-    names = [line.partition(":")[2].strip() for line in lines if "model name" in line]
-    return names[0] if names else platform.processor() or "unknown"
-
-
-def main() -> None:
-    """Measure and print."""
-    drawn = [plant for i in range(REALISATIONS // CHUNK) for plant in plants(i)]
-    print(
-        f"{REALISATIONS} realisations, {SAMPLES} samples; plain loops on {PLAIN} of "
-        f"them; fastest of {REPEATS}, processor time\n"
-        f"nmss-lab {nmss_lab.__version__}, Python {platform.python_version()}, "
-        f"NumPy {np.__version__}, qpsolvers {qpsolvers.__version__}; {processor()}, "
-        f"{os.cpu_count()} processors"
-    )
+def measure(
+    quick: bool = False, say: Callable[[str], None] = print
+) -> Iterator[Figure]:
+    """Yield the figures of ensembles."""
     for reading in ("zero", "held"):
-        compare(drawn, reading)
-    print(
-        f'worker processes, reading "held", {CHUNK} realisations a task, drawing and '
-        "sampling the plants included; time on the wall"
-    )
-    scale()
+        say(f'ensembles: reading "{reading}"')
+        yield from compare(reading, *((100, 2, 2) if quick else (1000, 20, 7)))
+    say("ensembles: worker processes")
+    yield from growth(*((4, 25, 2) if quick else (16, 250, 5)))
 
 
 if __name__ == "__main__":
-    main()
+    show(measure)

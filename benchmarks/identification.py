@@ -1,35 +1,34 @@
 """Time of an order search beside a plain loop over output-error fits by SciPy.
 
 Run as ``python benchmarks/identification.py``.  Both fit the same 64 structures to the
-same 1,000 samples in the same process, three times in turn; the shortest times count.
-The loop is what one writes without a library for the task: start at least squares on
-the equation, minimise the simulation error with ``scipy.optimize.least_squares``.
+same 1,000 samples, in turns; first in one process, then both in two.  The loop is what
+one writes without a library for the task: start at least squares on the equation,
+minimise the simulation error with ``scipy.optimize.least_squares``.
 """
+
+from __future__ import annotations
 
 import os
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-import platform
-import time
-from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
-from pathlib import Path
+from collections.abc import Callable, Iterator
+from functools import partial
 
 import numpy as np
-import scipy
+from frame import Figure, compared, in_turns, show
 from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
-import nmss_lab
-from nmss_lab.identify import Orders, order_search, prbs, structures
+from nmss_lab.identify import Candidate, Orders, order_search, prbs, structures
+from nmss_lab.parallel import executor_for, in_order
 from nmss_lab.records import Record
 
+PART = "Identification"
 SAMPLES = 1000
 RANGE = range(1, 5)
 """Values of each of na, nb and nk: 64 structures."""
 
-REPEATS = 3
 SAME = 1e-3
 """Relative difference up to which two mean square errors count as one minimum."""
 
@@ -57,51 +56,48 @@ def by_scipy(data: Record, orders: Orders) -> float:
     return float(np.mean(least_squares(error, begin, x_scale="jac").fun ** 2))
 
 
-def fastest(task: Callable[[], object]) -> float:
-    """Seconds of the fastest of the repetitions."""
-    times = []
-    for _ in range(REPEATS):
-        begin = time.perf_counter()
-        task()
-        times.append(time.perf_counter() - begin)
-    return min(times)
-
-
-def processor() -> str:
-    """Name of the processor."""
-    info = Path("/proc/cpuinfo")
-    lines = info.read_text(encoding="utf-8").splitlines() if info.exists() else []
-    names = [line.partition(":")[2].strip() for line in lines if "model name" in line]
-    return names[0] if names else platform.processor() or "unknown"
-
-
-def main() -> None:
-    """Measure and print."""
-    data = record()
+def measure(
+    quick: bool = False, say: Callable[[str], None] = print
+) -> Iterator[Figure]:
+    """Yield the figures of an order search."""
+    data, rounds = record(), 2 if quick else 9
     tries = structures(1, RANGE, RANGE, RANGE)
-    ours = {str(c.orders): c.estimate for c in order_search(data, RANGE, RANGE, RANGE)}
-    theirs = {str(orders): by_scipy(data, orders) for orders in tries}
-    ratios = np.array([ours[k].variance / theirs[k] for k in theirs if ours[k]])
-    loop = fastest(lambda: [by_scipy(data, orders) for orders in tries])
-    serial = fastest(lambda: order_search(data, RANGE, RANGE, RANGE))
-    with ProcessPoolExecutor(2) as pool:
-        order_search(data, [1], [1], [1, 2], executor=pool)  # starts the processes
-        pair = fastest(lambda: order_search(data, RANGE, RANGE, RANGE, executor=pool))
-    print(f"{len(tries)} structures, {SAMPLES} samples, fastest of {REPEATS}")
-    print(
-        f"nmss-lab {nmss_lab.__version__}, Python {platform.python_version()}, "
-        f"NumPy {np.__version__}, SciPy {scipy.__version__}; {processor()}, "
-        f"{os.cpu_count()} processors"
+    fit = partial(by_scipy, data)
+    for processes in (1, 2):
+        say(f"identification: processes: {processes}")
+        with executor_for(processes) as pool:
+            works = {
+                "ours": lambda pool=pool: order_search(
+                    data, RANGE, RANGE, RANGE, executor=pool
+                ),
+                "theirs": lambda pool=pool: list(in_order(fit, tries, pool)),
+            }
+            for work in works.values():
+                work()  # starts the processes
+            times, found = in_turns(works, rounds)
+        yield compared(
+            PART,
+            "order search" + (" in two processes" if pool else ""),
+            f"{len(tries)} structures, {SAMPLES} samples; {rounds} times",
+            times["ours"],
+            "output-error fits by scipy" + (" in two processes" if pool else ""),
+            times["theirs"],
+            unit="s",
+            note=quality(found["ours"], dict(zip(tries, found["theirs"], strict=True))),
+        )
+
+
+def quality(ours: list[Candidate], theirs: dict[Orders, float]) -> str:
+    """Say how mean square errors compare."""
+    ratios = np.array(
+        [each.estimate.variance / theirs[each.orders] for each in ours if each.estimate]
     )
-    print(f"output error by SciPy   {loop:8.3f} s")
-    print(f"order_search            {serial:8.3f} s, {loop / serial:.1f} times as fast")
-    print(f"  in two processes      {pair:8.3f} s, {loop / pair:.1f} times as fast")
-    print(
+    return (
         f"mean square error: the same in {np.sum(np.abs(ratios - 1) < SAME)}, lower in "
-        f"{np.sum(ratios < 1 - SAME)}, higher in {np.sum(ratios > 1 + SAME)} structures"
+        f"{np.sum(ratios < 1 - SAME)}, higher in {np.sum(ratios > 1 + SAME)}, none in "
+        f"{len(theirs) - len(ratios)}; ours also gives covariances and criteria"
     )
-    print("order_search also gives covariances and criteria; the loop does not")
 
 
 if __name__ == "__main__":
-    main()
+    show(measure)

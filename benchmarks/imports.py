@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 
 from frame import Figure, compared, show
 
-ROUNDS, QUICK = 30, 2
+ROUNDS, QUICK = 30, 1
 KEPT_OUT = "panel", "bokeh", "pandas", "matplotlib", "jupyterlab", "qpsolvers"
 """What importing the library must not bring along."""
 

@@ -18,7 +18,6 @@ import os
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import dataclasses
-import gc
 import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
@@ -27,7 +26,7 @@ import daqp
 import numpy as np
 import proxsuite
 import qpsolvers
-from frame import Figure, compared, show
+from frame import Figure, compared, show, uncollected
 
 from nmss_lab.cases import case
 from nmss_lab.controller import Limits, Move, Status
@@ -164,8 +163,8 @@ def timed(
     loop: Loop,
     controller: PredictiveController,
     seed: int,
-    solver: Callable[..., Any] | None,
-    direct: Direct,
+    solver: Callable[..., Any] | None = None,
+    direct: Direct | None = None,
 ) -> Iterator[Took]:
     """Run a loop; time its decisions, or a solver that is asked right after them."""
     decides = controller.decide
@@ -174,7 +173,7 @@ def timed(
         begin = time.perf_counter()
         move = decides(*parts)
         took[:] = time.perf_counter() - begin, 0.0
-        if solver is not None:
+        if solver is not None and direct is not None:
             begin = time.perf_counter()
             vectors = direct.vectors(move.known)
             between = time.perf_counter()
@@ -209,7 +208,7 @@ def run(loop: Loop, seeds: Sequence[int]) -> tuple[np.ndarray, dict[str, np.ndar
     controller = loop.design.build()
     assert isinstance(controller, PredictiveController)
     direct = Direct(controller)
-    first = np.array(list(timed(loop, controller, 0, None, direct)))
+    first = np.array(list(timed(loop, controller, 0)))
     calls = {
         "decide": None,
         DAQP: direct.by_daqp,
@@ -231,12 +230,8 @@ def measure(
     for loop in loops():
         say(f"steps: {loop.title}")
         for seeds in ([0] * count, range(1, count + 1)):
-            gc.collect()
-            gc.disable()
-            try:
+            with uncollected():
                 first, took = run(loop, seeds)
-            finally:
-                gc.enable()
             yield from figures(loop, first, took, noise=seeds[0] > 0)
 
 

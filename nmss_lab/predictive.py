@@ -165,18 +165,29 @@ class RankedProgram:
         status = Status.SOFTENED if broken else Status.LIMITED
         return _cut(solution, self.program.n_z, solution.multipliers), status
 
+    @cached_property
+    def _stages(self) -> list[tuple[Array, Array, QuadraticProgram]]:
+        """Rows kept so far, rows of a rank, and the program that lets those give way.
+
+        One a rank, the most important first; rows of later ranks are left out.
+        """
+        stages = []
+        price = 1e6 * np.abs(self.program.H).max()
+        for rank in np.unique(self.ranks[self._giving]):
+            kept = np.flatnonzero(self.ranks <= rank)
+            rows = np.flatnonzero(self.ranks == rank)
+            part = self.program.only(kept.tolist())
+            places, weight = np.searchsorted(kept, rows), np.full(rows.size, price)
+            stages.append((kept, rows, part.softened(places, weight)))
+        return stages
+
     def _solve_by_rank(
         self, theta: Array, bounds: tuple[Array, Array]
     ) -> tuple[Solution, Status]:
         """Break each rank of rows as little as the more important ones allow."""
         low, high = bounds[0].copy(), bounds[1].copy()
-        for rank in np.unique(self.ranks[self._giving]):
-            rows = np.flatnonzero(self.ranks == rank)
-            later = self.ranks > rank
-            free = np.where(later, -np.inf, low), np.where(later, np.inf, high)
-            weight = np.full(rows.size, 1e6 * np.abs(self.program.H).max())
-            program = self.program.softened(rows, weight)
-            solution = solve(program, theta, self.backend, free)
+        for kept, rows, program in self._stages:
+            solution = solve(program, theta, self.backend, (low[kept], high[kept]))
             if not solution.found:
                 return solution, Status.SHIFTED
             missed, margin = solution.decision[self.program.n_z :], 1e-7

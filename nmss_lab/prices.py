@@ -8,13 +8,15 @@ Convex Optimization, section 5.6).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from nmss_lab.controller import Status
 from nmss_lab.models import Array
 from nmss_lab.predictive import PredictiveController
-from nmss_lab.qp import Row
+from nmss_lab.qp import QuadraticProgram, Row
 from nmss_lab.sdp import StateDependentGovernor
 from nmss_lab.sdp_mpc import StateDependentController
 from nmss_lab.simulate import Run
@@ -111,22 +113,46 @@ def _more_room(
     """
     assert run.moves is not None
     program, multipliers = controller.program, run.multipliers[k]
-    sign = np.sign(multipliers[held])
-    push = program.push[:, held]
-    # what the decision, and the multipliers, do for a unit more room in each
-    inverse = np.linalg.pinv(program.M[held] @ push, hermitian=True)
-    change = push @ inverse * sign
-    drop = -inverse * sign
-    z, theta = run.moves.decision[k], run.moves.known[k]
-    free = np.setdiff1d(np.arange(len(program.labels)), held)
+    sign = np.sign(multipliers[held]).astype(np.int8)
+    known = KNOWN.setdefault(program, {})
+    key = held.tobytes() + sign.tobytes()
+    if key not in known:
+        known[key] = _response(program, held, sign)
+    found = known[key]
+    z, theta, free = run.moves.decision[k], run.moves.known[k], found.free
     value = program.M[free] @ z + program.offset[free] @ theta
-    slope = program.M[free] @ change
     small = 1e-12 * (1.0 + np.abs(program.M).max(initial=0.0))
     with np.errstate(divide="ignore", invalid="ignore"):
-        up = (program.upper[free] - value)[:, None] / slope
-        down = (program.lower[free] - value)[:, None] / slope
-        reach = np.where(slope > small, up, np.where(slope < -small, down, np.inf))
-        turns = -multipliers[held][:, None] / drop
-        turns = np.where(drop * multipliers[held][:, None] < 0.0, turns, np.inf)
+        up = (program.upper[free] - value)[:, None] / found.slope
+        down = (program.lower[free] - value)[:, None] / found.slope
+        rises, falls = found.slope > small, found.slope < -small
+        reach = np.where(rises, up, np.where(falls, down, np.inf))
+        turns = -multipliers[held][:, None] / found.drop
+        meets = found.drop * multipliers[held][:, None] < 0.0
+        turns = np.where(meets, turns, np.inf)
     ends = np.concatenate([reach, turns]).min(axis=0)
-    return controller.first_move.gain @ change, np.maximum(ends, 0.0)
+    return controller.first_move.gain @ found.change, np.maximum(ends, 0.0)
+
+
+class _Response(NamedTuple):
+    """What a unit more room in each held row changes.
+
+    Decision (n_z, held), multipliers (held, held) and the other rows (free, held).
+    """
+
+    change: Array
+    drop: Array
+    slope: Array
+    free: Array
+
+
+KNOWN: WeakKeyDictionary[QuadraticProgram, dict[bytes, _Response]] = WeakKeyDictionary()
+"""Responses by the rows that are held, which samples share; gone with the program."""
+
+
+def _response(program: QuadraticProgram, held: Array, sign: Array) -> _Response:
+    push = program.push[:, held]
+    inverse = np.linalg.pinv(program.M[held] @ push, hermitian=True)
+    change = push @ inverse * sign
+    free = np.setdiff1d(np.arange(len(program.labels)), held)
+    return _Response(change, -inverse * sign, program.M[free] @ change, free)

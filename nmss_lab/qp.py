@@ -188,14 +188,17 @@ class QuadraticProgram:
     def without(self, *names: str) -> QuadraticProgram:
         """Return the program without the rows of these names (6.1.2)."""
         gone = set(self._numbers(names).tolist())
-        keep = [i for i in range(len(self.labels)) if i not in gone]
+        return self.only([i for i in range(len(self.labels)) if i not in gone])
+
+    def only(self, rows: Sequence[int]) -> QuadraticProgram:
+        """Return the program with some of its rows."""
         return dataclasses.replace(
             self,
-            M=self.M[keep],
-            offset=self.offset[keep],
-            lower=self.lower[keep],
-            upper=self.upper[keep],
-            labels=tuple(self.labels[i] for i in keep),
+            M=self.M[rows],
+            offset=self.offset[rows],
+            lower=self.lower[rows],
+            upper=self.upper[rows],
+            labels=tuple(self.labels[i] for i in rows),
         )
 
     def softened(self, rows: Array, weight: Array) -> QuadraticProgram:

@@ -30,6 +30,7 @@ from nmss_lab.files import load, save
 FAULTY = """
 import sys
 import apps.session
+import nmss_lab.laws
 import nmss_lab.qp
 from apps.pages import governor
 from nmss_lab.cli import main
@@ -38,6 +39,11 @@ def solver(problem):
     if len(problem.H) == 7:
         raise RuntimeError("the solver is poorly")
     return healthy(problem)
+
+def held(self, theta):
+    if len(self.program.H) == 7:
+        raise RuntimeError("the solver is poorly")
+    return asked(self, theta)
 
 def loop(plant, controller, scenario):
     if getattr(controller, "horizon", None) and controller.horizon.Np == 13:
@@ -50,7 +56,9 @@ def page():
     return whole()
 
 healthy, sound, whole = nmss_lab.qp._daqp, apps.session.closed_loop, governor.page
-nmss_lab.qp.BACKENDS["daqp"] = solver
+asked = nmss_lab.laws.Solver.held
+nmss_lab.qp.BACKENDS["active_set"] = solver
+nmss_lab.laws.Solver.held = held
 apps.session.closed_loop = loop
 governor.page = page
 sys.exit(main(sys.argv[1:]))
