@@ -125,7 +125,7 @@ export function render({ model, el }) {
   }
   const note = element("span", { class: "said", role: "status" })
 
-  const bar = element("div", { class: "designs", role: "group", "aria-label": "Design" },
+  const bar = element("div", { class: "designs" },
     loaded, undo, redo, slots.A[0], slots.B[0], compare, file, note)
   el.append(bar)
 

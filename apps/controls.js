@@ -1,6 +1,6 @@
 // A form made from a description: sliders, selections, and a reset.
-// Values go to the server one at a time: the next leaves when the last is answered,
-// so that the latest value wins and nothing queues.
+// Values go to the server one at a time: the next leaves when the last is answered, or
+// is told to take a while; so the latest value wins and nothing queues.
 
 const shown = (value) => {
   if (!Number.isFinite(value)) return String(value)
@@ -20,6 +20,7 @@ export function render({ model, el }) {
   let building = false
   let sent = 0
   let address = 0
+  let alone = false    // whether it must be answered before the next: it brings others
   let painted = () => {}
   let busy = 0
   const open = {}
@@ -33,8 +34,9 @@ export function render({ model, el }) {
   window.nmssForm = { latency, idle }  // for tests and measurements
 
   const send = () => {
-    if (waiting !== null) { changed = true; return }
+    if (waiting !== null && (alone || model.busy.message !== waiting)) { changed = true; return }
     changed = false
+    alone = ["reset", "whole", "case"].some((name) => name in touched) || "whole" in values
     touched = {}
     busy = setTimeout(() => { document.documentElement.dataset.busy = "" }, 300)
     const left = performance.now()
@@ -310,6 +312,7 @@ export function render({ model, el }) {
     const answer = model.state.message
     if (waiting !== null && answer < waiting) return
     waiting = null
+    long.remove()
     clearTimeout(busy)
     delete document.documentElement.dataset.busy
     const done = painted
@@ -332,6 +335,23 @@ export function render({ model, el }) {
       if (name === "reset" || before[name] === items[name]) choose(name, value)
     }
   }
+
+  // An answer that takes a while
+  const bar = element("progress", { max: 1, value: 0, "aria-label": "Progress of the answer" })
+  const cancel = element("button", { type: "button", class: "wide" }, "Cancel")
+  const long = element("div", { class: "long", role: "group", "aria-label": "Working" }, bar, cancel)
+  cancel.addEventListener("click", () => {
+    alone = true
+    changed = false
+    waiting = ++sent
+    model.sent = { cancel: true, message: waiting }
+  })
+  model.on("busy", () => {
+    if (model.busy.message !== waiting) return
+    bar.value = model.busy.share
+    if (!long.isConnected) el.prepend(long)
+    if (changed) send()
+  })
 
   build()
   tellHistory()

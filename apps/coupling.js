@@ -6,7 +6,7 @@ const WIDTH = 220, HEIGHT = 110, LEFT = 44, BOTTOM = 20, TOP = 6, RIGHT = 6
 const tick = (value) => Number(value.toPrecision(3)).toString().replace("-", "\u2212")
 
 export function render({ model, el }) {
-  const box = element("div", { class: "coupling" })
+  const box = element("div", { class: "coupling", tabindex: 0, role: "group", "aria-label": "Cross-coupling" })
   el.append(box)
 
   const line = (t, values, x, y, held) => {

@@ -40,7 +40,23 @@ const colorsNow = () => {
   }
 }
 
-const recolour = (plot, colors) => {
+// A figure that is focused has a name, and a ring like all else.
+const present = (view) => {
+  const place = view.canvas_view.events_el
+  if (place.hasAttribute("role")) return
+  const { title } = view.model
+  const name = () => place.setAttribute("aria-label", title.text)
+  place.setAttribute("role", "img")
+  place.style.setProperty("--outline-width", "3px")
+  place.style.setProperty("--outline-style", "solid")
+  place.style.setProperty("--highlight-color", "var(--focus)")
+  title.properties.text.change.connect(name)
+  name()
+}
+
+const recolour = (view, colors) => {
+  const plot = view.model
+  present(view)
   const large = window.innerWidth >= 1900  // a projector, or a wall
   const size = large ? "15px" : "12px"
   quietly(plot.title, {
@@ -60,9 +76,7 @@ const recolour = (plot, colors) => {
     const values = kind === "band" ? { fill_color: color }
       : kind === "points" ? { fill_color: color, line_color: color }
       : { line_color: color }
-    for (const glyph of [renderer.glyph, renderer.nonselection_glyph]) {
-      quietly(glyph, values)
-    }
+    quietly(renderer.glyph, values)
   }
   for (const side of plot.center) {
     if (side.name === "limit") quietly(side, { line_color: colors.quiet })
@@ -110,7 +124,7 @@ const followTheme = (model, count, ready) => {
     const colors = colorsNow()
     const views = Object.values(figureViews())
     if (views.length < count()) { setTimeout(colour, 60); return }
-    for (const view of views) recolour(view.model, colors)
+    for (const view of views) recolour(view, colors)
     ready()
   }
   window.addEventListener("nmss-theme", colour)

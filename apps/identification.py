@@ -65,6 +65,9 @@ LOOK = {
 LARGEST = 5_000_000
 """Bytes of an uploaded file."""
 
+BEYOND = 1e100
+"""Numbers that large have no squares to be summed."""
+
 FEWEST = 20
 """Samples of a record that is worth a fit."""
 
@@ -124,10 +127,11 @@ def uploaded(name: str, data: bytes, size: int | None = None) -> Upload:
             f"the file has {size / 1e6:.1f} MB; up to {LARGEST / 1e6:.0f} MB are read"
         )
     text = _text(data)
+    lines = csv.reader(io.StringIO(text, newline=""))
     try:
-        rows = list(csv.reader(io.StringIO(text, newline="")))
+        rows = list(lines)
     except csv.Error as error:
-        raise ValueError(f"this is no table of text: {error}") from error
+        raise ValueError(f"row {lines.line_num} is no row of cells: {error}") from error
     if not any(rows):
         raise ValueError("the file is empty: row 1 should name the columns")
     heads = _heads(rows[0])
@@ -152,7 +156,8 @@ def _text(data: bytes) -> str:
     except UnicodeDecodeError as error:
         row = data[: error.start].count(b"\n") + 1
         raise ValueError(
-            f"row {row} holds bytes that are not text in UTF-8: is this a CSV file?"
+            f"row {row} holds bytes that are not text in UTF-8: is this a CSV "
+            "file, saved as UTF-8?"
         ) from error
     if "\0" in text:
         row = text[: text.index("\0")].count("\n") + 1
@@ -189,9 +194,9 @@ def _check_rows(rows: Sequence[Sequence[str]], width: int) -> None:
                 f"row {number} has {len(row)} cells, the header in row 1 has {width}"
             )
     if len(filled) < 1 + FEWEST:
-        raise ValueError(
-            f"only {len(filled) - 1} rows of data; expected at least {FEWEST}"
-        )
+        count = len(filled) - 1
+        noun = "row" if count == 1 else "rows"
+        raise ValueError(f"only {count} {noun} of data; expected at least {FEWEST}")
 
 
 def _is(cell: str) -> bool:
@@ -769,11 +774,17 @@ def _imports(names: Sequence[str]) -> str:
 
 
 def _check_moves(record: Record, start: str) -> None:
-    """Refuse columns that never move, which nothing can be learnt of."""
+    """Refuse columns that nothing can be learnt of: too large, or never moving."""
     last = len(record.time) + 1
     groups = (("y", record.y), ("u", record.u), ("v", record.v))
     for group, signals in groups:
         for name, values in zip(record.names[group], signals.T, strict=True):
+            at = int(np.argmax(np.abs(values)))
+            if abs(values[at]) > BEYOND:
+                raise ValueError(
+                    f"row {at + 2}, column {name!r}: {values[at]:g} is too large to "
+                    f"compute with; expected less than {BEYOND:g}"
+                )
             stepped = group != "y" and start == "rest" and values[0] != 0.0
             if np.ptp(values) == 0.0 and not stepped:
                 hint = (

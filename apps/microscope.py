@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import itertools
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -35,7 +36,11 @@ WIDTH = 5
 """Numbers for each limit."""
 
 
-def magnified(runs: Mapping[str, Run], input: int) -> dict[str, Any]:
+def magnified(
+    runs: Mapping[str, Run],
+    input: int,
+    hears: Callable[[float], None] | None = None,
+) -> dict[str, Any]:
     """Gather the prices of all samples, for ``Microscope``.
 
     Parameters
@@ -43,6 +48,8 @@ def magnified(runs: Mapping[str, Run], input: int) -> dict[str, Any]:
     runs : mapping of str to Run
     input : int
         The input whose moves are shown.
+    hears : function of a share, optional
+        Hears at each sample which share of them is done, and may end it by raising.
 
     Returns
     -------
@@ -53,21 +60,28 @@ def magnified(runs: Mapping[str, Run], input: int) -> dict[str, Any]:
         its row, saving, share of the cost, reach and move, float32.
     """
     first = next(iter(runs.values()))
+    count, total = itertools.count(1), sum(map(len, runs.values()))
+
+    def heard() -> None:
+        if hears is not None:
+            hears(next(count) / total)
+
     name = first.controller.model.u_names[input]
     return {
         "samples": len(first),
         "width": WIDTH,
         "input": name,
         "unit": first.controller.model.units.get(name, ""),
-        "runs": [_of(name, run, input) for name, run in runs.items()],
+        "runs": [_of(name, run, input, heard) for name, run in runs.items()],
     }
 
 
-def _of(name: str, run: Run, input: int) -> dict[str, Any]:
+def _of(name: str, run: Run, input: int, heard: Callable[[], None]) -> dict[str, Any]:
     model = run.controller.model
     texts: dict[tuple[str, ...], int] = {}
     counts, more, data = [], [], []
     for k in range(len(run)):
+        heard()
         found = prices(run, k)
         counts.append(len(found[:MOST]))
         more.append(len(found) - counts[-1])

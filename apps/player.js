@@ -269,7 +269,7 @@ export function render({ model, el }) {
 
   const theme = () => {
     colors = colorsNow()
-    for (const view of Object.values(views)) recolour(view.model, colors)
+    for (const view of Object.values(views)) recolour(view, colors)
     request()
   }
 

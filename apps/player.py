@@ -37,11 +37,14 @@ class Controls(JSComponent):
     ``form`` and ``state`` come from the server: "groups" and "defaults", and "values"
     and the number of the "message" they answer; ``form`` is set before ``state``, or
     has a "number" which ``state`` names as "form".
-    ``sent`` goes to the server: all values and the number of the "message".
+    ``busy`` tells of a message whose answer takes a while, and the "share" that is
+    done.  ``sent`` goes to the server: all values, or "cancel", and the number of the
+    "message"; it may do so before the answer to one that is told to be busy.
     """
 
     form = param.Dict(default={})
     state = param.Dict(default={})
+    busy = param.Dict(default={})
     sent = param.Dict(default={})
 
     _esm = script("controls.js")

@@ -116,9 +116,10 @@ def server(
         websocket_max_message_size=LARGEST_MESSAGE,
         **login,
     )
-    if prefix:  # links are relative to the folder
+    if prefix:  # links are relative to the folder; a watch need not know of it
         folder = {"url": f"{prefix}/", "permanent": False}
-        made._tornado.add_handlers(".*", [(prefix, RedirectHandler, folder)])
+        also = [(prefix, RedirectHandler, folder), ("/health", Health)]
+        made._tornado.add_handlers(".*", also)
     PeriodicCallback(Tidy(made), 1000 * LOOKED_AFTER).start()
     return made
 

@@ -70,7 +70,7 @@ export function render({ model, el }) {
   const fill = () => {
     const { columns, rows, linear } = model.sheet
     const focused = el.getRootNode().activeElement?.dataset?.focus
-    group.replaceChildren(element("th"),
+    group.replaceChildren(element("td"),
       element("th", { scope: "colgroup", colspan: linear + 1 }, "Without limits, linear"),
       element("th", { scope: "colgroup", colspan: columns.length - linear }, "This run, with limits"))
     head.replaceChildren(sorter("title", "Structure", "Ticked rows, up to three, are plotted"),

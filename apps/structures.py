@@ -246,7 +246,9 @@ class StructuresChoices(LoopChoices):
         self.designs()
         plant, scenario = self.plant(), self.scenario()
         scores, reasons = dict[str, Score](), dict[str, str]()
-        for name in self.rows:
+        for number, name in enumerate(self.rows):
+            if self.hears is not None:
+                self.hears(number / len(self.rows))
             try:
                 design = self._in_place(self._design(name))
                 scores |= compare({name: design}, plant, scenario, self.output)

@@ -61,7 +61,7 @@ export function render({ model, el }) {
       element("th", { scope: "row" }, row.event),
       element("td", {}, swatch(row.style), " ", row.design), ...cells(row, keys)))
     rates.replaceChildren(
-      element("h3", {}, "Rates, and how badly"),
+      element("h2", {}, "Rates, and how badly"),
       element("p", { class: "quiet verdict" }, verdict),
       table(["Event", "Structure", ...RATES.map(([, text]) => text)], lines, "Rates and severity"),
       element("div", { class: "search" },
@@ -80,7 +80,7 @@ export function render({ model, el }) {
         return element("tr", {}, element("th", { scope: "row" }, choose),
           element("td", {}, row.value), element("td", {}, row.radius))
       })
-      return element("div", {}, element("h3", {}, swatch(part.style), ` Worst of ${part.design}`),
+      return element("div", {}, element("h2", {}, swatch(part.style), ` Worst of ${part.design}`),
         table(["Realisation", part.measure, "largest pole"], lines, `Worst of ${part.design}`))
     }))
     if (focused) worst.querySelector(`[data-row="${focused}"]`)?.focus()
@@ -95,7 +95,7 @@ export function render({ model, el }) {
     const loops = one.loops.map((loop) => element("span", {}, swatch(loop.style),
       ` ${loop.design}: ${one.measure} ${loop.value}, largest pole ${loop.radius}`))
     picked.replaceChildren(
-      element("h3", {}, `Realisation ${one.number}`),
+      element("h2", {}, `Realisation ${one.number}`),
       element("p", { class: "values" }, ...values,
         element("span", { class: "quiet" }, "in brackets: nominal")),
       element("p", { class: "values" }, ...loops),

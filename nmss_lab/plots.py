@@ -22,12 +22,17 @@ from bokeh.models import (
     ColumnDataSource,
     CustomJSTickFormatter,
     DataRange1d,
+    Glyph,
+    GlyphRenderer,
     GridPlot,
     HoverTool,
     Legend,
+    Line,
     Range1d,
+    Scatter,
     Span,
     TapTool,
+    VArea,
 )
 from bokeh.plotting import figure
 
@@ -162,6 +167,11 @@ class Chart:
     log_across: bool = False
     origin: float | None = None
     step: float | None = None
+
+    @property
+    def has_flags(self) -> bool:
+        """Whether curves may have values marked with a cross."""
+        return any(curve.flags is not None for curve in self.curves)
 
     @property
     def span(self) -> tuple[float, float]:
@@ -1003,8 +1013,9 @@ def _lines(box: _Box, chart: Chart) -> list[dict[str, Any]]:
     """Every renderer's line; empty where the chart has no such curve."""
     curves: dict[str, Curve | None] = {f"style{i}": None for i in range(len(STYLES))}
     curves |= {f"style{curve.style}": curve for curve in chart.curves}
-    curves |= {f"flag{i}": None for i in range(len(STYLES))}
-    curves |= {f"flag{curve.style}": curve.flagged for curve in chart.curves}
+    if chart.has_flags:
+        curves |= {f"flag{i}": None for i in range(len(STYLES))}
+        curves |= {f"flag{curve.style}": curve.flagged for curve in chart.curves}
     curves["ink"] = chart.references[0] if chart.references else None
     lines = []
     for name, curve in curves.items():
@@ -1113,7 +1124,9 @@ class ChartFigure:
         times = times or Range1d(*chart.span)
         self.figure = _empty_figure(chart, times)
         self.curves = [ColumnDataSource({"t": [], "y": []}) for _ in STYLES]
-        self.flags = [ColumnDataSource({"t": [], "y": []}) for _ in STYLES]
+        self.flags = [
+            ColumnDataSource({"t": [], "y": []}) for _ in STYLES if chart.has_flags
+        ]
         self.references = ColumnDataSource({"t": [], "y": []})
         self._lines = [
             _add_line(self.figure, source, number)
@@ -1121,10 +1134,8 @@ class ChartFigure:
         ]
         for number, source in enumerate(self.flags):
             _add_flags(self.figure, source, number)
-        ink = self.figure.line(
-            "t", "y", source=self.references, color=INK, width=1.4, level="overlay"
-        )
-        ink.name = "ink"
+        ink = Line(x="t", y="y", line_color=INK, line_width=1.4)
+        _add(self.figure, self.references, ink, name="ink", level="overlay")
         self.limits = [_limit_line() for _ in range(2)]
         for line in self.limits:
             self.figure.add_layout(line)
@@ -1145,9 +1156,10 @@ class ChartFigure:
         """Draw another chart."""
         with_style = {curve.style: curve for curve in chart.curves}
         for style, source in enumerate(self.curves):
+            _fill(source, with_style.get(style))
+        for style, source in enumerate(self.flags):
             curve = with_style.get(style)
-            _fill(source, curve)
-            _fill(self.flags[style], curve and curve.flagged)
+            _fill(source, curve and curve.flagged)
         _fill(self.references, chart.references[0] if chart.references else None)
         for line, value in zip(self.limits, chart.limits, strict=True):
             line.update(location=value if np.isfinite(value) else None)
@@ -1213,40 +1225,41 @@ def _point_columns(curve: Curve | None) -> dict[str, Array]:
 
 def _add_band(plot: figure, source: ColumnDataSource, number: int) -> None:
     color = STYLES[number]["color"]
-    band = plot.varea(
-        "t", "low", "high", source=source, fill_color=color, fill_alpha=0.18
-    )
-    band.name, band.level = f"band{number}", "underlay"
+    band = VArea(x="t", y1="low", y2="high", fill_color=color, fill_alpha=0.18)
+    _add(plot, source, band, name=f"band{number}", level="underlay")
 
 
 def _add_points(plot: figure, source: ColumnDataSource, number: int) -> None:
     style = STYLES[number]
-    points = plot.scatter(
-        "t",
-        "y",
+    points = Scatter(
+        x="t",
+        y="y",
         size="size",
-        source=source,
         marker=str(style["marker"]),
         fill_color=style["color"],
         line_color=style["color"],
         fill_alpha=0.3,
         line_alpha=0.8,
     )
-    points.name = f"points{number}"
+    _add(plot, source, points, name=f"points{number}")
 
 
 def _add_flags(plot: figure, source: ColumnDataSource, number: int) -> None:
-    flags = plot.scatter(
-        "t",
-        "y",
-        source=source,
-        size=9,
-        marker="x",
-        line_color=STYLES[number]["color"],
-        line_width=2,
-        level="overlay",
+    color = STYLES[number]["color"]
+    flags = Scatter(x="t", y="y", size=9, marker="x", line_color=color, line_width=2)
+    _add(plot, source, flags, name=f"flag{number}", level="overlay")
+
+
+def _add(
+    plot: figure, source: ColumnDataSource, glyph: Glyph, **more: Any
+) -> GlyphRenderer:
+    """Draw with a glyph, and no others for what is muted or not selected.
+
+    They would make a figure's models twice as many, and all cost time and memory.
+    """
+    return plot.add_glyph(
+        source, glyph, nonselection_glyph=None, muted_glyph=None, **more
     )
-    flags.name = f"flag{number}"
 
 
 def _empty_figure(chart: Chart, times: Range1d | DataRange1d) -> figure:
@@ -1284,16 +1297,15 @@ def _empty_figure(chart: Chart, times: Range1d | DataRange1d) -> figure:
 
 def _add_line(plot: figure, source: ColumnDataSource, number: int) -> Any:
     style = STYLES[number]
-    return plot.line(
-        "t",
-        "y",
-        source=source,
-        color=style["color"],
-        width=2.2,
+    line = Line(
+        x="t",
+        y="y",
+        line_color=style["color"],
+        line_width=2.2,
         line_dash=list(style["dash"]),
         line_join="round",
-        name=f"style{number}",
     )
+    return _add(plot, source, line, name=f"style{number}")
 
 
 def _limit_line() -> Span:
@@ -1676,8 +1688,6 @@ class EnsembleFigure(EstimateFigure):
             for renderer in self.figure.renderers
             if str(renderer.name).startswith("points")
         ]
-        for cloud in self.clouds:
-            cloud.nonselection_glyph = None  # one that is picked dims no other
         for number in range(len(STYLES)):
             self._add_picked(number)
         self.figure.add_tools(TapTool(renderers=self.clouds))
@@ -1685,36 +1695,20 @@ class EnsembleFigure(EstimateFigure):
         self.figure.toolbar.active_scroll = None
 
     def _add_picked(self, number: int) -> None:
-        color = STYLES[number]["color"]
-        thin = self.figure.line(
-            "t", "y", source=self.thin[number], color=color, line_dash=[1, 3], width=1.6
-        )
-        thin.name = f"nominal{number}"
-        crosses = self.figure.scatter(
-            "t",
-            "y",
-            source=self.crosses[number],
-            marker="x",
-            size=12,
-            line_color=color,
-            line_width=2.6,
-        )
-        crosses.name = f"cross{number}"
-        line = self.figure.line(
-            "t", "y", source=self.lines[number], color=color, width=4, line_alpha=0.75
-        )
-        line.name = f"picked{number}"
-        rings = self.figure.scatter(
-            "t",
-            "y",
-            source=self.rings[number],
-            marker=str(STYLES[number]["marker"]),
-            size=14,
-            fill_color=None,
-            line_color=color,
-            line_width=2.4,
-        )
-        rings.name = f"ring{number}"
+        style = STYLES[number]
+        at = {"x": "t", "y": "y", "line_color": style["color"]}
+        cross = Scatter(marker="x", size=12, line_width=2.6, **at)
+        shape = {"marker": str(style["marker"]), "fill_color": None}
+        ring = Scatter(size=14, line_width=2.4, **shape, **at)
+        dots = Line(line_dash=[1, 3 + 2 * number], line_width=1.6, **at)
+        thick = Line(line_dash=list(style["dash"]), line_width=4, line_alpha=0.75, **at)
+        for name, sources, glyph in (
+            ("nominal", self.thin, dots),
+            ("cross", self.crosses, cross),
+            ("picked", self.lines, thick),
+            ("ring", self.rings, ring),
+        ):
+            _add(self.figure, sources[number], glyph, name=f"{name}{number}")
 
     def show(self, chart: Chart) -> None:
         """Draw another chart; a realisation that was picked stays."""
@@ -1864,18 +1858,16 @@ class PoleFigure(ChartFigure):
                 ("ring", kinds[0], STYLES[style]["marker"], 13 + 3 * style),
                 ("cross", kinds[1], "x", 13),
             ):
-                points = self.figure.scatter(
-                    "t",
-                    "y",
-                    source=source,
+                points = Scatter(
+                    x="t",
+                    y="y",
                     marker=str(marker),
                     size=size,
                     fill_color=None,
                     line_color=STYLES[style]["color"],
                     line_width=2.2,
                 )
-                points.name = f"{kind}{style}"
-                drawn.append(points)
+                drawn.append(_add(self.figure, source, points, name=f"{kind}{style}"))
         hover = HoverTool(
             renderers=drawn,
             tooltips=[("real", "@t"), ("imaginary", "@y"), ("modulus", "@modulus")],

@@ -381,7 +381,7 @@ def test_a_row_by_keyboard_leads_to_the_loop(visit: Open, server: Server) -> Non
     page.wait_for_function("nmssStudy.picked() !== null")
     expect(page.locator(".row[aria-pressed=true]").first).to_be_visible()
     number = row.inner_text().split()[1]
-    expect(page.locator(".drawn h3")).to_have_text(f"Realisation {number}")
+    expect(page.locator(".drawn h2")).to_have_text(f"Realisation {number}")
     expect(page.locator(".drawn")).to_contain_text("b1")
     page.wait_for_function(
         "Bokeh.documents[0].get_model_by_name('output').renderers"

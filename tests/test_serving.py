@@ -18,6 +18,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import param
 import pytest
 from conftest import Server, watched
 from playwright.sync_api import Browser, expect
@@ -25,9 +27,18 @@ from tornado.httpclient import HTTPClientError
 from tornado.websocket import WebSocketClosedError
 from visitors import Visitor, run
 
+from apps.disturbances import DisturbanceChoices
+from apps.identification import IdentifyChoices
 from apps.kept import Kept, Origin
-from apps.pages.live import PAGES
+from apps.pages.live import KEPT, PAGES
+from apps.robustness import RobustnessChoices
 from apps.serving import LARGEST_MESSAGE, _without_data
+from apps.session import Choices, Form, GovernorChoices, LoopChoices, afford
+from apps.structures import StructuresChoices
+from apps.tuning import TuneChoices
+from apps.varying import VaryingChoices
+from apps.work import Withdrawn
+from apps.workbench import WorkbenchChoices
 from nmss_lab import __version__
 from nmss_lab.cases import CASES, case
 from nmss_lab.cli import main
@@ -319,6 +330,7 @@ def test_every_page_below_a_prefix(tmp_path: Path, browser: Browser) -> None:
         assert missing == []
         assert ask(server.url.rstrip("/"))[0] == 200
         assert ask(server.url.replace("/lab/mpc/", "/"))[0] == 404
+        assert ask(server.url.replace("/lab/mpc/", "/health"))[0] == 200
 
 
 # --- Several processes ---------------------------------------------------------------
@@ -469,12 +481,161 @@ def test_a_message_beyond_the_limit_ends_its_page_only(server: Server) -> None:
     run(visit())
 
 
+# --- Bounds --------------------------------------------------------------------------
+
+RUN = LoopChoices, GovernorChoices, DisturbanceChoices, VaryingChoices
+"""Choices of pages that run loops while somebody waits."""
+
+OTHERS: dict[type[Form], Any] = {
+    StructuresChoices: StructuresChoices.sheet,
+    TuneChoices: TuneChoices.bench,
+    RobustnessChoices: RobustnessChoices.study,
+}
+"""Choices of other pages with cases, and what those begin with."""
+
+
+@pytest.mark.parametrize("form", [*RUN, *OTHERS, IdentifyChoices, WorkbenchChoices])
+def test_every_number_is_bounded(form: type[Form]) -> None:
+    """Each number of each form has a lowest and a highest value, and keeps to them."""
+    choices = form()
+    for key in choices.names():
+        parameter = choices.param[key]
+        if not isinstance(parameter, param.Number):
+            continue
+        low, high = parameter.bounds
+        assert np.isfinite([low, high]).all(), key
+        before = getattr(choices, key)
+        for value in (low - 1, high + 1, "nan", "inf", -np.inf, "1e999", "9" * 9999):
+            with pytest.raises(ValueError, match=f"^{key} = ") as refused:
+                choices.put({key: value})
+            assert len(str(refused.value)) < 600
+        assert getattr(choices, key) == before
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("form", [*RUN, *OTHERS])
+def test_every_case_opens(form: Any) -> None:
+    """What a page opens with is never too much, whichever case."""
+    begin = OTHERS.get(form, form.runs)
+    for name in form.cases():
+        assert begin(form(case=name))
+
+
+@pytest.mark.parametrize(
+    ("name", "given", "message"),
+    [
+        ("temperature_7_4_2", {"Np": 80, "limit_y": "own"}, r"take 7\.9 times"),
+        ("gasifier_6_3_4", {"Np": 80, "limit_y": "own"}, "switch off the limits on y"),
+        ("gasifier_6_3_4", {"Np": 80}, "lower Np to"),
+    ],
+)
+def test_what_takes_too_long_is_refused(
+    name: str, given: dict[str, Any], message: str
+) -> None:
+    """Horizons and samples have a budget; what is said to fit it does, just."""
+    choices = GovernorChoices(case=name)
+    choices.put(given)
+    with pytest.raises(ValueError, match=message) as refused:
+        choices.runs()
+    fits = int(re.search(r"lower Np to (\d+)", str(refused.value))[1])  # type: ignore[index]
+    choices.put({"Np": fits})
+    afford(choices.designs(), len(choices.scenario()))
+    choices.put({"Np": fits + 1})
+    with pytest.raises(ValueError, match=f"lower Np to {fits}"):
+        choices.runs()
+
+
+@pytest.mark.parametrize("form", RUN)
+def test_runs_tell_how_far_they_are_and_can_be_ended(form: type[Choices]) -> None:
+    """The share that is done grows up to all of it, and whoever hears may end it."""
+    choices, shares = form(), list[float]()
+    choices.hears = shares.append
+    choices.runs()
+    assert shares == sorted(shares)
+    assert shares[-1] == 1.0
+
+    def end(share: float) -> None:
+        if share > 0.5:
+            raise Withdrawn
+
+    choices.put({"Np": choices.Np + 1})
+    choices.hears = end
+    with pytest.raises(Withdrawn):
+        choices.runs()
+
+
+def test_a_long_answer_gives_way(server: Server) -> None:
+    """It tells how far it is; the next choice, or a cancel, is answered instead."""
+
+    async def visit() -> None:
+        visitor = await Visitor.open(server.url, "governor?case=temperature_7_4_2")
+        values = visitor.value("Controls", "state")["values"]
+
+        async def ask_much(message: int) -> None:
+            sent = {**values, "Np": 40, "limit_y": "own", "message": message}
+            await visitor.put("Controls", "sent", sent)
+            await visitor.until(lambda: told()["message"] == message)
+            assert 0.0 < told()["share"] < 1.0
+
+        def told() -> dict[str, Any]:
+            return visitor.value("Controls", "busy") or {"message": 0}
+
+        async def answer(message: int) -> dict[str, Any]:
+            def state() -> dict[str, Any]:
+                found: dict[str, Any] = visitor.value("Controls", "state")
+                return found
+
+            await visitor.until(lambda: state()["message"] >= message)
+            assert state()["message"] == message
+            return state()["values"] | {"said": visitor.value("text-alert", "text")}
+
+        before = visitor.value("Player", "run")
+        await ask_much(1)
+        await visitor.put("Controls", "sent", {**values, "Np": 12, "message": 2})
+        given = await answer(2)
+        assert given["Np"] == 12
+        assert not given["said"]
+        shown = visitor.value("Player", "run")
+        assert shown != before
+        await ask_much(3)
+        await visitor.put("Controls", "sent", {"cancel": True, "message": 4})
+        given = await answer(4)
+        assert given["Np"] == 40
+        assert "Cancelled." in given["said"]
+        assert KEPT in given["said"]
+        assert visitor.value("Player", "run") == shown
+        await visitor.close()
+
+    run(visit())
+
+
+def test_an_address_of_any_bytes_opens(server: Server) -> None:
+    """Bytes that are no text are named like any wrong choice."""
+
+    async def visit() -> None:
+        visitor = await Visitor.open(server.url, "governor?case=%ff%00%3Cb%3E")
+        assert "there is no such case" in visitor.value("text-alert", "text")
+        await visitor.close()
+
+    run(visit())
+
+
 # --- Many ----------------------------------------------------------------------------
+
+
+SOON = """
+import sys
+import apps.serving
+from nmss_lab.cli import main
+apps.serving.KEPT_FOR, apps.serving.LOOKED_AFTER = 8, 1
+sys.exit(main(sys.argv[1:]))
+"""
+"""Serves as ever, but forgets pages that were closed in half of the time."""
 
 
 async def crowd(server: Server, count: int, seconds: float) -> None:
     """Open pages, change a slider of each every second, and close them."""
-    gate = asyncio.Semaphore(8)
+    gate = asyncio.Semaphore(4)
 
     async def opened() -> Visitor:
         async with gate:
@@ -489,15 +650,33 @@ async def crowd(server: Server, count: int, seconds: float) -> None:
             Np = 10 + (int(time.monotonic()) + number) % 20
             await asyncio.gather(visitor.choose(Np=Np), asyncio.sleep(1.0))
             assert visitor.value("Controls", "state")["values"]["Np"] == Np
+            assert not visitor.value("text-alert", "text")
 
     await asyncio.gather(*(used(visitor, i) for i, visitor in enumerate(visitors)))
     await asyncio.gather(*(visitor.close() for visitor in visitors))
 
 
+def memory(server: Server) -> float:
+    """Return the megabytes that a server holds."""
+    status = Path(f"/proc/{server.process.pid}/status").read_text()
+    found = re.search(r"VmRSS:\s+(\d+) kB", status)
+    assert found
+    return int(found[1]) / 1000.0
+
+
 @pytest.mark.slow
-def test_a_crowd_is_served(tmp_path: Path) -> None:
-    """Thirty pages are open and used at once, each answered; then none is left."""
-    with serving(tmp_path) as server:
-        run(crowd(server, 30, 5.0))
+@LINUX
+def test_a_hundred_are_served_and_forgotten(tmp_path: Path) -> None:
+    """A hundred pages are open and used at once, each answered; then none is left.
+
+    Their memory is given back: within 10 % of what a few pages had left behind.
+    """
+    with serving(tmp_path, command=(sys.executable, "-c", SOON)) as server:
+        run(crowd(server, 8, 2.0))
         wait_for_none(server)
+        time.sleep(3.0)  # until it has been tidied up
+        before = memory(server)
+        run(crowd(server, 100, 8.0))
+        wait_for_none(server)
+        until(lambda: memory(server) < 1.1 * before)
         assert "ERROR" not in server.log.read_text()

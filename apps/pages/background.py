@@ -90,6 +90,8 @@ class BackgroundPage:
         """Do something; what is wrong with it becomes the complaint."""
         try:
             action()
+        except Withdrawn:  # whatever asked meanwhile is answered instead
+            raise
         except ValueError as error:
             self.complaint = f"{error}.\n{KEPT}".replace("..\n", ".\n")
         except Exception:  # whoever asked waits for an answer, whatever happens

@@ -14,7 +14,8 @@ from panel.custom import JSComponent
 
 from apps.player import STYLE, hand_over, script
 from apps.session import HELD, case_title, held, open_design, plain
-from nmss_lab.files import Study, dumps
+from nmss_lab.design import Design
+from nmss_lab.files import Study, case_of, dumps, loads
 from nmss_lab.report import report
 from nmss_lab.simulate import Run
 
@@ -195,8 +196,12 @@ class WithBar:
                 f"{name} has {size / 1e6:.3g} MB, a design file has up to "
                 f"{LARGEST / 1e6:g} MB"
             )
+        text = str(sent.get("text", ""))
         try:
-            leads = open_design(str(sent.get("text", "")))
+            content = loads(text)
+            if isinstance(content, Study | Design):
+                case_of(content, "content")  # can it be built?
+            leads = open_design(text)
         except ValueError as error:
             raise ValueError(f"{name}: {error}") from error
         hand_over(self.bar, "leads", to=leads)

@@ -25,6 +25,7 @@ from apps.pages.bar import WithBar
 from apps.pages.live import (
     ADDRESS,
     FAULT,
+    _code,
     _complaint,
     _from_address,
     _number,
@@ -405,7 +406,7 @@ class IdentifyPage(WithRecord, WithBar, BackgroundPage):
         self.lead.object = _paragraph(words)
         self.alert.object = _complaint(self.complaint)
         orders = next(iter(self.compared), "")
-        self.python.object = f"<pre>{html.escape(choices.script(orders))}</pre>"
+        self.python.object = _code(choices.script(orders))
         self.bar.told = self._loaded()
 
     # What the bar has of this page: models, and the design that each begins with

@@ -6,7 +6,8 @@ import contextlib
 import html
 import logging
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -22,6 +23,7 @@ from apps.microscope import Microscope, magnified
 from apps.pages.bar import FAULT, WithBar
 from apps.player import INSIDE, Controls, Player, moving, stepping
 from apps.session import HELD, Choices, plain
+from apps.work import Withdrawn
 from nmss_lab.cases import Case
 from nmss_lab.measures import table
 from nmss_lab.plots import Chart, ChartFigure, busiest_sample, time_unit
@@ -49,6 +51,12 @@ PARTS = (
 )
 
 ADDRESS = "In the address of this page: "
+PATIENT, TOLD_EVERY = 0.5, 0.2
+"""Seconds after which an answer tells how far it is, and between two times."""
+
+OPENING = 5.0
+"""Seconds that runs may take while a page opens: the others wait for them."""
+
 KEPT = "The picture still shows the last choices that worked."
 
 COLUMNS = {
@@ -98,16 +106,40 @@ class WithForm:
 
     choices: Any
     complaint: str
+    controls: Controls
     _forms = 0
 
     def _opened(self, action: Callable[[], Opened]) -> Opened:
         """Do it with the choices of the address; if it cannot be, with the case's."""
+        self.choices.hears = _soon_enough()
         try:
             return action()
         except ValueError as error:
             self.complaint = self.complaint or f"{ADDRESS}{error}"
             self.choices.take_case(self.choices.case)
+            self.choices.hears = _soon_enough()
             return action()
+        finally:
+            self.choices.hears = None
+
+    @contextlib.contextmanager
+    def _attended(self, message: int) -> Iterator[None]:
+        """Tell the form how far a long answer is; end it once there is a newer one."""
+        asked, told = self.controls.sent, time.monotonic() + PATIENT - TOLD_EVERY
+
+        def hears(share: float) -> None:
+            nonlocal told
+            if self.controls.sent is not asked:
+                raise Withdrawn
+            if time.monotonic() - told > TOLD_EVERY:
+                told = time.monotonic()
+                self.controls.busy = {"message": message, "share": share}
+
+        self.choices.hears = hears
+        try:
+            yield
+        finally:
+            self.choices.hears = None
 
     def _form(self) -> dict[str, Any]:
         choices = self.choices
@@ -125,6 +157,8 @@ class WithForm:
 
     def _accept(self, sent: Mapping[str, Any]) -> None:
         """Take over what the form sent: all anew, another case, or choices."""
+        if sent.get("cancel", False):
+            raise ValueError("Cancelled.")
         if sent.get("whole", False):
             self.choices.accept(sent)
         elif sent.get("reset", False):
@@ -145,7 +179,7 @@ class LivePage(WithForm, WithBar):
         self.lead, self.alert, self.measures, self.python, self.notes = (
             _text(name) for name in ("lead", "alert", "measures", "python", "notes")
         )
-        self.runs, charts = self._opened(self._compute)
+        charts = self._opened(self._answer)
         times = Range1d(*charts[0].span)
         self.figures = {chart.name: ChartFigure(chart, times) for chart in charts}
         self.player = Player(
@@ -158,6 +192,7 @@ class LivePage(WithForm, WithBar):
         self.controls = Controls(
             form=self._form(), state=self._state(0), sizing_mode="stretch_width"
         )
+        self._case = self.choices.case
         self._make_bar()
         self._tell()
         self._measure()
@@ -180,6 +215,19 @@ class LivePage(WithForm, WithBar):
         if self.inside is not None and self.subject.inside is not None:
             self.inside.run = stepping(*self.subject.inside(self.choices))
 
+    def _answer(self) -> list[Chart]:
+        """Compute the runs, one half of the work, and the prices of their limits."""
+        choices, hears = self.choices, self.choices.hears
+        assert hears is not None
+        choices.hears = lambda share: hears(share / 2)
+        runs, charts = self._compute()
+        named = {plain(name): run for name, run in runs.items()}
+        self.seen = magnified(
+            named, choices.input, lambda share: hears((1 + share) / 2)
+        )
+        self.runs = runs
+        return charts
+
     def _compute(self) -> tuple[dict[str, Run], list[Chart]]:
         runs = self.choices.runs()
         named = {plain(name): run for name, run in runs.items()}
@@ -196,20 +244,22 @@ class LivePage(WithForm, WithBar):
     def _take(self, event: Any) -> None:
         """Take over what the form sent, compute, show, and answer."""
         sent = dict(event.new)
-        message, case = sent.pop("message", 0), self.choices.case
-        described = self.choices.description()
+        message = sent.pop("message", 0)
         try:
             self._accept(sent)
-            self.runs, charts = self._compute()
+            with self._attended(message):
+                charts = self._answer()
             self._look_inside()
             self.complaint = ""
+        except Withdrawn:
+            return  # whatever asked meanwhile is answered instead
         except ValueError as error:
             self.complaint, charts = f"{error}\n{KEPT}", []
         except Exception:  # the form waits for an answer, whatever happens
             LOG.exception("choices %s", self.choices.values())
             self.complaint, charts = f"{FAULT}\n{KEPT}", []
-        fresh = self.choices.case != case
-        anew = fresh or self.choices.description() != described
+        fresh, self._case = self.choices.case != self._case, self.choices.case
+        anew = fresh or self.choices.description() != self.controls.form["groups"]
         if charts:
             named, start = self._named(), self._start()
             self.player.run = moving(charts, named, start, fresh)
@@ -230,9 +280,9 @@ class LivePage(WithForm, WithBar):
 
     def _measure(self) -> None:
         """Show prices, table and Python of the runs."""
-        self.microscope.seen = magnified(self._named(), self.choices.input)
+        self.microscope.seen = self.seen
         self.measures.object = _measures(self._named(), self.choices.output)
-        self.python.object = f"<pre>{html.escape(self.choices.script())}</pre>"
+        self.python.object = _code(self.choices.script())
 
     def template(self) -> pn.Template:
         """Put the page together."""
@@ -252,6 +302,10 @@ def live_page(subject: Subject) -> pn.Template:
 
 class Frame(pn.Template):
     """A page whose document is gone through once, when all of it is there."""
+
+    def __repr__(self) -> str:
+        """Be brief: Panel asks at each part that is added, and would list them all."""
+        return type(self).__name__
 
     def server_doc(
         self, doc: Document | None = None, *args: Any, **more: Any
@@ -314,6 +368,20 @@ def _text(name: str) -> pn.pane.HTML:
     )
 
 
+def _soon_enough() -> Callable[[float], None]:
+    """Give what hears of the first runs, and ends them if they take too long."""
+    until = time.monotonic() + OPENING
+
+    def hears(share: float) -> None:
+        if time.monotonic() > until:
+            raise ValueError(
+                f"this takes more than {OPENING:g} s, {share:.0%} were done; choose it "
+                "again in the form"
+            )
+
+    return hears
+
+
 def _from_address(choices: Choices) -> str:
     """Take the choices in the page's address; return what is wrong with them.
 
@@ -321,7 +389,7 @@ def _from_address(choices: Choices) -> str:
     does not have are left behind without a word.
     """
     arguments = pn.state.session_args or {}
-    given = {key: values[0].decode() for key, values in arguments.items()}
+    given = {k: values[0].decode(errors="replace") for k, values in arguments.items()}
     came = given.pop("via", "")
     try:
         choices.accept(given)
@@ -337,6 +405,11 @@ def _from_address(choices: Choices) -> str:
 
 def _paragraph(text: str) -> str:
     return f"<p>{html.escape(text)}</p>"
+
+
+def _code(text: str) -> str:
+    """Show Python as text, which scrolls by keyboard, too."""
+    return f'<pre tabindex="0">{html.escape(text)}</pre>'
 
 
 def _notes(example: Case, more: str = "") -> str:

@@ -24,6 +24,7 @@ from apps.pages.bar import WithBar
 from apps.pages.live import (
     FAULT,
     WithForm,
+    _code,
     _complaint,
     _from_address,
     _number,
@@ -237,8 +238,12 @@ class RobustnessPage(WithForm, WithBar, BackgroundPage):
 
     @property
     def _stale(self) -> bool:
-        """Whether there is no study, or one with other choices."""
-        return self.job is None or self.job.lines != tuple(self.choices.study_lines())
+        """Whether there is no study, or one with other choices, possible or not."""
+        try:
+            lines = tuple(self.choices.study_lines())
+        except ValueError:  # the page says why
+            return True
+        return self.job is None or self.job.lines != lines
 
     def _open(self) -> None:
         """Begin with what the address asks for."""
@@ -624,7 +629,7 @@ class RobustnessPage(WithForm, WithBar, BackgroundPage):
         done = None if self.found is None or self.running else len(self.found)
         view = self._view()
         text = shown.rates_script(view.output, view.peak, done)
-        self.python.object = f"<pre>{html.escape(text)}</pre>"
+        self.python.object = _code(text)
         self.bar.told = self._loaded()
 
     def _bounds_in_words(self) -> str:

@@ -16,6 +16,7 @@ from apps.pages.background import BackgroundPage
 from apps.pages.bar import WithBar
 from apps.pages.live import (
     WithForm,
+    _code,
     _complaint,
     _from_address,
     _notes,
@@ -33,6 +34,7 @@ from apps.structures import (
     best_of,
     verdict,
 )
+from apps.work import Withdrawn
 from nmss_lab.analysis import OFFSET_FREE, ROUNDING
 from nmss_lab.comparison import FADING, Score
 from nmss_lab.plots import (
@@ -159,12 +161,17 @@ class StructuresPage(WithForm, WithBar, BackgroundPage):
     def _take(self, event: Any) -> None:
         """Take over what the form sent, score, show, and answer."""
         sent = dict(event.new)
-        message, described = sent.pop("message", 0), self.choices.description()
-        if self._guard(lambda: self._score(sent), self.choices.values()):
+        message = sent.pop("message", 0)
+        try:
+            with self._attended(message):
+                good = self._guard(lambda: self._score(sent), self.choices.values())
+        except Withdrawn:
+            return
+        if good:
             charts = self._charts()
             self._painted(lambda: self._paint(charts))
             self._tabulate()
-        if self.choices.description() != described:
+        if self.choices.description() != self.controls.form["groups"]:
             self.controls.form = self._form()
         self._tell()
         self.controls.state = self._state(message)
@@ -244,7 +251,7 @@ class StructuresPage(WithForm, WithBar, BackgroundPage):
             f"{html.escape(title)}</span>"
             for style, title in enumerate(self._shown())
         )
-        self.python.object = f"<pre>{html.escape(choices.sheet_script(scores))}</pre>"
+        self.python.object = _code(choices.sheet_script(scores))
 
     def _told(self) -> str:
         """Say what the numbers are of."""

@@ -26,6 +26,7 @@ from apps.pages.live import (
     ADDRESS,
     FAULT,
     WithForm,
+    _code,
     _complaint,
     _from_address,
     _number,
@@ -721,7 +722,7 @@ class TunePage(WithForm, WithBar, BackgroundPage):
         self.weights.object = weight_table(self._designs())
         aims = self._aims()
         text = choices.script_of(self.place.before, aims, self.place.gain)
-        self.python.object = f"<pre>{html.escape(text)}</pre>"
+        self.python.object = _code(text)
         self.bar.told = self._loaded()
         if not self.served:
             self.grid.grid = self._cells()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import html
 import time
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -18,6 +17,7 @@ from apps.pages.bar import WithBar
 from apps.pages.identify import Upload, WithRecord
 from apps.pages.live import (
     WithForm,
+    _code,
     _complaint,
     _from_address,
     _paragraph,
@@ -311,7 +311,7 @@ class WorkbenchPage(WithRecord, WithForm, WithBar, BackgroundPage):
         self.lead.object = _paragraph(LEAD)
         self.alert.object = _complaint(self.complaint)
         text = python_of(self.bench, self.choices)
-        self.python.object = f"<pre>{html.escape(text)}</pre>"
+        self.python.object = _code(text)
         self.bar.told = self._loaded()
         self._show_steps()
 
