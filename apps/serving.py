@@ -16,6 +16,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 import panel as pn
+from bokeh.protocol.exceptions import ProtocolError
 from bokeh.server.urls import per_app_patterns
 from bokeh.settings import settings
 from bokeh.util.logconfig import basicConfig
@@ -24,6 +25,7 @@ from panel.io.server import DIST_DIR, Server, WSHandler, get_server
 from panel.io.state import state
 from tornado.ioloop import PeriodicCallback
 from tornado.web import RedirectHandler, RequestHandler, StaticFileHandler
+from tornado.websocket import WebSocketClosedError
 
 from apps import work
 from apps.dashboard import pages
@@ -222,9 +224,14 @@ class Prompt(WSHandler):
     """
 
     def open(self) -> None:
-        """Begin to talk with a page."""
-        super().open()
-        self.set_nodelay(True)
+        """Begin to talk with a page, unless it is none of ours or has gone."""
+        try:
+            super().open()
+        except ProtocolError as error:  # the connection is closed by now
+            LOG.warning("a page was refused: %s", error)
+            return
+        with contextlib.suppress(WebSocketClosedError):
+            self.set_nodelay(True)
 
 
 class OwnPages(Prompt):

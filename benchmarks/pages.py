@@ -56,7 +56,7 @@ BASELINES = {
 }
 SLIDER = "Np"
 CROWDED = "receding_horizon"
-VALUES = 60
+VALUES = 40
 """Movements of each slider."""
 
 TURNS, LASTING = 3, 5.0
@@ -64,7 +64,7 @@ TURNS, LASTING = 3, 5.0
 every five, so that each time has one look.
 """
 
-SECONDS, MOST = 12.0, 128
+SECONDS, MOST = 8.0, 64
 """Seconds of each size of the crowd, and the largest one."""
 
 OPENED, ROUNDS, FORGOTTEN = 20, 3, 30.0
