@@ -196,7 +196,8 @@ def chart(
             (("building", ours), ("condensing by plain NumPy", plain))
         )
     )
-    return Chart(name, f"Time to build: {title}", "ms", curves, samples=x, across=name)
+    heading = f"Time to build: {title}"
+    return Chart(name, heading, "ms", curves, samples=x, unit="", across=name)
 
 
 if __name__ == "__main__":

@@ -38,7 +38,7 @@ except ImportError:
     sync_playwright = None
 
 HERE = Path(__file__).resolve().parent
-PART = "page"
+PART = "Page"
 OURS = "-m", "nmss_lab.cli", "serve", "--port", "0"
 BARE = (str(HERE / "bare_page.py"),)
 
