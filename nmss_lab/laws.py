@@ -91,14 +91,17 @@ class Law:
         self.region, self.tested, self.instead = region, tested, instead
         self.limited = limited
         self.after: dict[bytes, Law] = {}
-        self.changed: dict[Law, Array] = {}
+        self.changed: dict[bytes, Array] = {}
 
     def changes(self, last: Law) -> Array:
         """How many rows are held otherwise than by another law, a number."""
-        if last not in self.changed:
+        key = last.region.held.tobytes()  # a law would keep all alive it led to
+        if key not in self.changed:
+            if len(self.changed) >= MOST:
+                self.changed.clear()
             changes = np.count_nonzero(self.region.held != last.region.held)
-            self.changed[last] = np.array(changes)
-        return self.changed[last]
+            self.changed[key] = np.array(changes)
+        return self.changed[key]
 
     def value(self, memory: Array, told: Array | None) -> Array:
         """All parts, for a memory vector and what ``decide`` is handed."""

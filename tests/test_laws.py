@@ -1,6 +1,7 @@
 """Laws of a single loop: right wherever they answer, learnt once, exact on limits."""
 
 import dataclasses
+import gc
 import pickle
 
 import numpy as np
@@ -10,7 +11,7 @@ from nmss_lab import qp
 from nmss_lab.cases import CASES, case, square_wave
 from nmss_lab.controller import Limits, Status
 from nmss_lab.governor import governor
-from nmss_lab.laws import Laws, Solver
+from nmss_lab.laws import Law, Laws, Solver
 from nmss_lab.models import DifferenceModel
 from nmss_lab.mpc import integral_of_error, wang_young
 from nmss_lab.pip import pole_gain
@@ -186,6 +187,26 @@ def test_what_is_kept_is_bounded(monkeypatch):
     other = closed_loop(MODEL, many, SCENARIO)
     assert len(many.laws) > 3
     assert np.array_equal(run.u, other.u)
+
+
+def test_laws_that_had_to_go_are_forgotten(monkeypatch):
+    """Those in use do not keep alive what they once came from: loops run for years."""
+    monkeypatch.setattr("nmss_lab.laws.MOST", 4)
+    controller = built()
+    rng = np.random.default_rng(0)
+    noise = [0.2 * rng.standard_normal((60, 1)) for _ in range(3)]
+    for each in noise:
+        loop = Scenario(1.5 * square_wave(60, 30), noise=each)
+        run = closed_loop(MODEL, controller, loop)
+        assert len({row.tobytes() for row in np.sign(run.multipliers)}) > 8
+        assert count_laws(controller) <= 4 + 1  # and the one without held rows
+
+
+def count_laws(controller):
+    """Count the laws of a controller that something still refers to."""
+    gc.collect()
+    laws = (each for each in gc.get_objects() if isinstance(each, Law))
+    return sum(law.region.program is controller.program for law in laws)
 
 
 def test_wrong_values_handed_to_decide_are_refused():
