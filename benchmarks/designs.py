@@ -15,14 +15,12 @@ import os
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import dataclasses
-import gc
-import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 import scipy.linalg
-from frame import Figure, compared, show
+from frame import Figure, compared, in_turns, show
 from steps import loops
 
 from nmss_lab.controller import Limits
@@ -63,22 +61,12 @@ def condensed(controller: PredictiveController, Q: np.ndarray, R: np.ndarray) ->
     return factor, scipy.linalg.cho_solve(factor, f), np.concatenate(rows), n_y
 
 
-def seconds(
+def milliseconds(
     tasks: dict[str, Callable[[], object]], rounds: int
 ) -> dict[str, list[float]]:
     """Milliseconds of all tasks, in turns."""
-    taken: dict[str, list[float]] = {name: [] for name in tasks}
-    gc.collect()
-    gc.disable()
-    try:
-        for _ in range(rounds):
-            for name, task in tasks.items():
-                begin = time.perf_counter()
-                task()
-                taken[name].append(1e3 * (time.perf_counter() - begin))
-    finally:
-        gc.enable()
-    return taken
+    taken, _ = in_turns(tasks, rounds)
+    return {name: [1e3 * each for each in times] for name, times in taken.items()}
 
 
 def tasks(design: Design) -> tuple[PredictiveController, dict[str, Callable]]:
@@ -102,7 +90,7 @@ def measure(
     for loop in loops():
         say(f"designs: {loop.title}")
         controller, both = tasks(loop.design)
-        taken = seconds(both, rounds)
+        taken = milliseconds(both, rounds)
         size = (
             f"{loop.title}: Np = {controller.horizon.Np}, n_x = "
             f"{controller.form.n_x}, {controller.n_z} variables"
@@ -150,7 +138,7 @@ def growth(rounds: int, quick: bool, say: Callable[[str], None]) -> Iterator[Fig
         say(f"designs: growth with {name}")
         sizes, ours, plain = [], [], []
         for size, design in designs[:: 3 if quick else 1]:
-            taken = seconds(tasks(design)[1], max(3, rounds // 4))
+            taken = milliseconds(tasks(design)[1], max(3, rounds // 4))
             sizes.append(float(size))
             ours.append(taken["ours"])
             plain.append(taken["plain"])

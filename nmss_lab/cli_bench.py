@@ -10,9 +10,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-PARTS = (
-    "steps, peers, designs, ensembles, state_dependent, identification, imports, pages"
-)
+from nmss_lab.cli_serve import beside
 
 
 def add_bench(commands: Any) -> None:
@@ -21,7 +19,7 @@ def add_bench(commands: Any) -> None:
         "bench", help="measure times, each beside a baseline of the same run"
     )
     add = bench.add_argument
-    add("part", nargs="*", help=f"some of {PARTS}; all by default")
+    add("part", nargs="*", help="such as steps or pages; all by default")
     add("--quick", action="store_true", help="few repetitions: does it run?")
     add("--json", action="store_true", help="print JSON")
     add(
@@ -35,12 +33,13 @@ def add_bench(commands: Any) -> None:
 
 def _bench(arguments: argparse.Namespace) -> int:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    folder = _folder()
+    folder = beside() / "benchmarks"
     sys.path.insert(0, str(folder))
     frame, run = (importlib.import_module(name) for name in ("frame", "run"))
     unknown = [part for part in arguments.part if part not in run.PARTS]
     if unknown:
-        raise ValueError(f'there is no benchmark "{unknown[0]}"; there are {PARTS}')
+        known = ", ".join(run.PARTS)
+        raise ValueError(f'there is no benchmark "{unknown[0]}"; there are {known}')
     parts = arguments.part or run.PARTS
     figures, failures = run.collect(parts, arguments.quick, _say)
     if arguments.json:
@@ -62,10 +61,3 @@ def _bench(arguments: argparse.Namespace) -> int:
 def _say(text: str) -> None:
     """Tell how far it is, apart from what is printed."""
     print(text, file=sys.stderr, flush=True)
-
-
-def _folder() -> Path:
-    """Folder of the benchmarks: in the wheel, or beside ``nmss_lab`` in a checkout."""
-    here = Path(__file__).resolve().parent
-    shipped = here / "_pages" / "benchmarks"
-    return shipped if shipped.is_dir() else here.parent / "benchmarks"

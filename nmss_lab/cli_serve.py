@@ -220,12 +220,17 @@ def _run(server: Any, arguments: argparse.Namespace, shared: _Shared | None) -> 
 
 
 def _serving() -> Any:
-    """Return the module ``apps.serving``.
+    """Return the module ``apps.serving``."""
+    sys.path.insert(0, str(beside()))
+    return importlib.import_module("apps.serving")
 
-    A wheel carries the package ``apps`` in ``nmss_lab/_pages``; in a checkout it
-    lies beside ``nmss_lab``.
+
+def beside() -> Path:
+    """Folder of ``apps`` and ``benchmarks``.
+
+    A wheel carries them in ``nmss_lab/_pages``; in a checkout they lie beside
+    ``nmss_lab``.
     """
     here = Path(__file__).resolve().parent
     shipped = here / "_pages"
-    sys.path.insert(0, str(shipped if shipped.is_dir() else here.parent))
-    return importlib.import_module("apps.serving")
+    return shipped if shipped.is_dir() else here.parent

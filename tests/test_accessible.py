@@ -92,7 +92,7 @@ def menu(page: Page, name: str) -> None:
 
 @pytest.mark.parametrize("path", READY)
 def test_no_rule_is_broken(visit: Open, path: str) -> None:
-    """With all panels open, dark at a desk and light on a phone, by turns."""
+    """With all panels open, light and dark, at a desk and on a phone."""
     page = opened(visit, path)
     page.evaluate(
         f"() => {{ {DEEP}; for (const node of all())"
@@ -100,7 +100,9 @@ def test_no_rule_is_broken(visit: Open, path: str) -> None:
     )
     page.evaluate(AXE)
     for theme, width, name in (
-        ("dark", 1440, "A:"),
+        ("light", 1440, "A:"),
+        ("dark", 1440, "B:"),
+        ("dark", 390, "File"),
         ("light", 390, "File"),
     ):
         turn(page, theme, width)

@@ -51,8 +51,8 @@ ORDER = [
     "plots",
     "svg",
     "report",
-    "cli_bench",
     "cli_serve",
+    "cli_bench",
     "cli_studies",
     "cli",
 ]
