@@ -346,9 +346,11 @@ def figures(loop: Loop, peer: Peer, rounds: int, steps: int | None) -> Iterator[
     ways = peer.ways(loop.design, controller)
     took: dict[str, list[Took]] = {name: [] for name in ("ours", *ways)}
     with uncollected():
-        list(timed(loop, controller, 0))  # it has run the loop before
+        list(timed(loop, controller, loop.scenario))  # it has run the loop before
         for _ in range(rounds):
-            took["ours"] += itertools.islice(timed(loop, controller, 0), steps)
+            took["ours"] += itertools.islice(
+                timed(loop, controller, loop.scenario), steps
+            )
             for name, way in ways.items():
                 answers = asked(loop, controller, name, way, peer.same)
                 took[name] += itertools.islice(answers, steps)

@@ -8,7 +8,8 @@ can do who calls it.
 
 The controller has run the loop before: it knows which rows are held in it.  What the
 first loop takes is told apart, and so are loops with output noise, none of which
-repeats another.
+repeats another.  The plan behind a move is worked out when it is asked for: decisions
+whose plan was asked for at once are told apart, too.
 """
 
 from __future__ import annotations
@@ -33,14 +34,14 @@ from nmss_lab.controller import Limits, Move, Status
 from nmss_lab.design import Design
 from nmss_lab.models import Plant
 from nmss_lab.predictive import PredictiveController
-from nmss_lab.simulate import Scenario, samples
+from nmss_lab.simulate import Scenario, closed_loop, samples
 
 PART = "Step"
 LOOPS, QUICK = 30, 2
 """Closed loops of each example, and of a quick run."""
 
 NOISE = 0.005
-"""Standard deviation of the noise, in shares of the largest reference."""
+"""Standard deviation of an output's noise, in shares of its largest deviation."""
 
 SAME = 1e-7
 """Largest difference from DAQP's decision, relative to 1 + the largest entry."""
@@ -88,12 +89,15 @@ def loops() -> list[Loop]:
     return found
 
 
-def noisy(scenario: Scenario, seed: int) -> Scenario:
-    """Scenario with output noise of its own; with seed 0 there is none."""
-    r = scenario.reference
-    noise = np.random.default_rng(seed).standard_normal(r.shape)
-    size = NOISE * np.abs(r).max() if seed else 0.0
-    return dataclasses.replace(scenario, noise=size * noise)
+def noisy(scenario: Scenario, seed: int, spans: np.ndarray) -> Scenario:
+    """Scenario with output noise of its own; with seed 0 there is none.
+
+    ``spans`` are the largest deviations of the outputs without it.
+    """
+    if seed == 0:
+        return scenario
+    noise = np.random.default_rng(seed).standard_normal(scenario.reference.shape)
+    return dataclasses.replace(scenario, noise=NOISE * spans * noise)
 
 
 class Direct:
@@ -156,13 +160,14 @@ class Direct:
 
 
 Took = tuple[bool, float, float]
-"""Whether a limit was active, microseconds of the call, and of forming its vectors."""
+"""Whether a limit was active, microseconds of the call, and of what belongs to it: of
+forming a solver's vectors, or of working out the plan behind a move."""
 
 
 def timed(
     loop: Loop,
     controller: PredictiveController,
-    seed: int,
+    scenario: Scenario,
     solver: Callable[..., Any] | None = None,
     direct: Direct | None = None,
 ) -> Iterator[Took]:
@@ -172,7 +177,9 @@ def timed(
     def decide(*parts: Any) -> Move:
         begin = time.perf_counter()
         move = decides(*parts)
-        took[:] = time.perf_counter() - begin, 0.0
+        between = time.perf_counter()
+        _ = move.decision
+        took[:] = between - begin, time.perf_counter() - between
         if solver is not None and direct is not None:
             begin = time.perf_counter()
             vectors = direct.vectors(move.known)
@@ -186,7 +193,7 @@ def timed(
     took = np.zeros(2)
     vars(controller)["decide"] = decide  # a frozen design takes it no other way
     try:
-        for sample in samples(loop.plant, controller, noisy(loop.scenario, seed)):
+        for sample in samples(loop.plant, controller, scenario):
             limited = bool(sample.move.status == Status.LIMITED)
             yield limited, 1e6 * took[0], 1e6 * took[1]
     finally:
@@ -208,7 +215,9 @@ def run(loop: Loop, seeds: Sequence[int]) -> tuple[np.ndarray, dict[str, np.ndar
     controller = loop.design.build()
     assert isinstance(controller, PredictiveController)
     direct = Direct(controller)
-    first = np.array(list(timed(loop, controller, 0)))
+    first = np.array(list(timed(loop, controller, loop.scenario)))
+    y = closed_loop(loop.plant, controller, loop.scenario).y
+    spans = np.abs(y - y[0]).max(axis=0)
     calls = {
         "decide": None,
         DAQP: direct.by_daqp,
@@ -217,8 +226,9 @@ def run(loop: Loop, seeds: Sequence[int]) -> tuple[np.ndarray, dict[str, np.ndar
     }
     rows: dict[str, list[Took]] = {name: [] for name in calls}
     for seed in seeds:
+        scenario = noisy(loop.scenario, seed, spans)
         for name, solver in calls.items():
-            rows[name] += timed(loop, controller, seed, solver, direct)
+            rows[name] += timed(loop, controller, scenario, solver, direct)
     return first, {name: np.array(took) for name, took in rows.items()}
 
 
@@ -263,6 +273,9 @@ def figures(
         yield compared(PART, name, at, ours, direct, theirs, **goal)
         both = chosen[direct][:, 1:].sum(axis=1)
         yield compared(PART, name, at, ours, f"{direct}, its vectors formed", both)
+        planned = chosen["decide"][:, 1:].sum(axis=1)
+        asked = f"decide and its plan, {when}"
+        yield compared(PART, asked, at, planned, f"{direct}, its vectors formed", both)
         theirs = chosen[QPSOLVERS][:, 1]
         yield compared(PART, name, at, ours, QPSOLVERS, theirs)
         tail, half = float(np.percentile(ours, 99)), float(np.median(ours))

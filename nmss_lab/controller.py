@@ -16,7 +16,7 @@ from __future__ import annotations
 import dataclasses
 import enum
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Literal
@@ -169,33 +169,6 @@ _SENTENCES = {
 
 
 @dataclass(eq=False, slots=True)
-class Memory:
-    """All that changes in a controller from sample to sample; never changed itself.
-
-    Parameters
-    ----------
-    vector : array (..., n_m)
-        Histories, laid out by the form's recipe.
-    decision, known, multipliers : arrays (..., n_z), (..., n_theta), (..., rows)
-        The last plan, to fall back on and to start the next solve from.
-    shift : integer array (...)
-        Samples since that plan was made; -1 when there is none.
-    refused : bool array (...)
-        Whether the latest measurement was not finite.
-    law : Law, optional
-        Law of a single loop's last move, the first to be looked at for the next.
-    """
-
-    vector: Array
-    decision: Array
-    known: Array
-    multipliers: Array
-    shift: Array
-    refused: Array
-    law: Law | None = None
-
-
-@dataclass(eq=False, slots=True)
 class Move:
     """Decision of one sample.
 
@@ -220,7 +193,7 @@ class Move:
         changes the cost J by twice its multiplier.
     iterations : integer array (...)
     shift : integer array (...)
-        Age of the plan in samples: 0 when it was made now.
+        Age of the plan in samples: 0 when it was made now, -1 when there is none.
     law : Law, optional
         The law that gave the move of a single loop, where one did.
     """
@@ -246,6 +219,25 @@ class Move:
     def sentence(self) -> str:
         """Status of a single move in plain words."""
         return Status(int(self.status)).sentence
+
+
+@dataclass(eq=False, slots=True)
+class Memory:
+    """All that changes in a controller from sample to sample; never changed itself.
+
+    Parameters
+    ----------
+    vector : array (..., n_m)
+        Histories, laid out by the form's recipe.
+    refused : bool array (...)
+        Whether the latest measurement was not finite.
+    last : Move
+        The last move: a plan to fall back on, and to start the next from.
+    """
+
+    vector: Array
+    refused: Array
+    last: Move
 
 
 @dataclass(frozen=True, eq=False)
@@ -379,8 +371,9 @@ class Controller(ABC):
 
     def _fresh(self, vector: Array) -> Memory:
         """Memory without a plan."""
-        empty = np.zeros(self.n_z), np.zeros(self.n_theta), np.zeros(self.n_rows)
-        return Memory(vector, *empty, np.array(-1), np.array(False))
+        none = np.zeros((1, self.model.n_u)), np.zeros((1, 1, self.model.n_y))
+        last = self._move(*none, shift=np.array([-1]))
+        return Memory(vector, np.array(False), _single(last))
 
     def _balanced(self, vector: Array, y: Array, u: Array) -> Array:
         """Memory at rest at y whose sum of the error makes the law ask for u."""
@@ -416,15 +409,7 @@ class Controller(ABC):
             v = np.where(np.isfinite(v), v, layout.read(before, "v")[..., 0, :])
             parts[1:3] = _alike(y, before), _alike(v, before)
             both = np.concatenate(parts, axis=-1)
-        return Memory(
-            both @ self._measuring.T,
-            memory.decision,
-            memory.known,
-            memory.multipliers,
-            memory.shift,
-            ~np.asarray(good),
-            memory.law,
-        )
+        return Memory(both @ self._measuring.T, ~np.asarray(good), memory.last)
 
     @cached_property
     def _measuring(self) -> Array:
@@ -467,7 +452,7 @@ class Controller(ABC):
         move = self._decide(many, *self._given(many, r, v))
         worse = many.refused & (move.status < Status.REFUSED)
         move.status[worse] = Status.REFUSED
-        return Move(*(part[0] for part in _parts(move))) if single else move
+        return _single(move) if single else move
 
     def _given(
         self, memory: Memory, r: Array | None, v: Array | None
@@ -511,16 +496,7 @@ class Controller(ABC):
         if "integral" in layout:
             vector = self._followed(memory, u, move)
         applied = np.concatenate([vector, u, seen, move.governed], axis=-1)
-        vector = applied @ self._applying.T
-        return Memory(
-            vector,
-            move.decision,
-            move.known,
-            move.multipliers,
-            move.shift,
-            memory.refused,
-            move.law,
-        )
+        return Memory(applied @ self._applying.T, memory.refused, move)
 
     def _followed(self, memory: Memory, u: Array, move: Move) -> Array:
         """Memory vector whose sum of the error fits the applied input."""
@@ -638,20 +614,24 @@ def _ahead(name: str, given: Array | None, now: Array, steps: int) -> Array:
 
 def as_ensemble(memory: Memory) -> Memory:
     """Memory of one loop with a leading axis, as an ensemble of one."""
-    return _memory(np.asarray(part)[None] for part in _parts(memory))
+    return stacked([memory], np.array([0]))
 
 
 def stacked(memories: Sequence[Memory], rows: Array) -> Memory:
     """Memory of an ensemble whose loops start as ``rows`` of some memories say."""
-    parts = zip(*map(_parts, memories), strict=True)
-    return _memory(np.stack(part)[rows] for part in parts)
+    parts = zip(*(_parts(memory.last) for memory in memories), strict=True)
+    return Memory(
+        np.stack([memory.vector for memory in memories])[rows],
+        np.stack([memory.refused for memory in memories])[rows],
+        Move(*(np.stack(part)[rows] for part in parts)),
+    )
 
 
-def _memory(parts: Iterable[Array]) -> Memory:
-    vector, decision, known, multipliers, shift, refused = parts
-    return Memory(vector, decision, known, multipliers, shift, refused)
+def _single(move: Move) -> Move:
+    """Move of the only loop, without a leading axis."""
+    return Move(*(part[0] for part in _parts(move)))
 
 
-def _parts(record: Memory | Move) -> list[Array]:
-    names = (part.name for part in dataclasses.fields(record))
-    return [getattr(record, name) for name in names if name != "law"]
+def _parts(move: Move) -> list[Array]:
+    names = (part.name for part in dataclasses.fields(move) if part.init)
+    return [getattr(move, name) for name in names]

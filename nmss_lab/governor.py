@@ -9,6 +9,7 @@ as the limits allow:
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from numbers import Real
 from typing import Literal
 
@@ -62,7 +63,7 @@ class ReferenceGovernor(PredictiveController):
         """0 when w_k is chosen at k, 1 when w_{k+1} is."""
         return int(not self.causal)
 
-    @property
+    @cached_property
     def follows_laws(self) -> bool:
         """Whether the present input is part of the plan."""
         return self.causal

@@ -32,38 +32,42 @@ LOOKS = 3
 
 
 class Law:
-    """What a loop gets from its memory while certain rows are held.
+    """What a loop gets while certain rows are held, from its memory.
 
-    ``table @ memory + ahead @ coming + edge`` holds, in this order, the reference in
-    force, u_k, the known vector, the decision, the multipliers and the tests, which
-    must all be positive.
+    All is affine in it: ``first`` gives, in this order, the tests, which must all be
+    positive, u_k and the reference in force; ``rest`` the known vector, the decision
+    and the multipliers of the held rows, which are needed later, if at all.  Both are
+    to be multiplied by what ``Laws.point`` returns.
 
     Parameters
     ----------
     region : Region
-    parts : list of arrays (n, n_theta + 1)
-        The parts, in that order, as maps of [theta; 1].
-    knows, coming : arrays (n_theta, n_m), (n_theta, n)
-        theta from the memory, and from what is handed to ``decide``; None where that
-        does not matter.
+    first, rest : lists of three arrays (n, points)
+        Their parts, in that order.
+    rows : integer array
+        The held rows.
     tested, instead : integer arrays (tests,)
         See ``Region``; a row of -1 says that no other law can be right.
     limited : bool
         Whether a limit is among the held rows; terminal equalities are none.
+
+    Attributes
+    ----------
+    after : dict
+        The law that was right the last time the same tests of this one failed, by
+        their signs.
     """
 
     __slots__ = (
         "after",
-        "ahead",
-        "changed",
-        "decision",
-        "edge",
+        "ends",
+        "first",
         "instead",
-        "known",
         "limited",
-        "multipliers",
+        "program",
         "region",
-        "table",
+        "rest",
+        "rows",
         "tested",
         "tests",
         "u",
@@ -73,43 +77,47 @@ class Law:
     def __init__(
         self,
         region: Region,
-        parts: list[Array],
-        knows: Array,
-        coming: Array | None,
+        first: list[Array],
+        rest: list[Array],
+        rows: Array,
         tested: Array,
         instead: Array,
         limited: bool,
     ) -> None:
-        stacked = np.concatenate(parts)
-        self.table = stacked[:, :-1] @ knows
-        self.ahead = None if coming is None else stacked[:, :-1] @ coming
-        self.edge = stacked[:, -1].copy()
-        ends = np.cumsum([0, *(len(part) for part in parts)]).tolist()
-        self.w, self.u, self.known, self.decision, self.multipliers, self.tests = (
-            slice(*ends[i : i + 2]) for i in range(len(parts))
+        # by columns, which BLAS is a little faster with
+        self.first, self.rest = (
+            np.asfortranarray(np.concatenate(parts)) for parts in (first, rest)
         )
-        self.region, self.tested, self.instead = region, tested, instead
-        self.limited = limited
+        ends = len(first[0]), len(first[0]) + len(first[1])
+        self.tests, self.u, self.w = slice(ends[0]), slice(*ends), slice(ends[1], None)
+        self.ends = len(rest[0]), len(rest[0]) + len(rest[1])
+        self.region, self.program = region, region.program
+        self.rows, self.limited = rows, limited
+        self.tested, self.instead = tested, instead
         self.after: dict[bytes, Law] = {}
-        self.changed: dict[bytes, Array] = {}
 
-    def changes(self, last: Law) -> Array:
-        """How many rows are held otherwise than by another law, a number."""
-        key = last.region.held.tobytes()  # a law would keep all alive it led to
-        if key not in self.changed:
-            if len(self.changed) >= MOST:
-                self.changed.clear()
-            changes = np.count_nonzero(self.region.held != last.region.held)
-            self.changed[key] = np.array(changes)
-        return self.changed[key]
+    @property
+    def nbytes(self) -> int:
+        """Bytes of both maps."""
+        return self.first.nbytes + self.rest.nbytes
 
-    def value(self, memory: Array, told: Array | None) -> Array:
-        """All parts, for a memory vector and what ``decide`` is handed."""
-        value: Array = self.table.dot(memory)
-        value += self.edge
-        if self.ahead is not None and told is not None:
-            value += self.ahead.dot(told)
-        return value
+    def learn(self, signs: bytes, right: Law) -> None:
+        """Note which law was right where tests had these signs."""
+        if len(self.after) >= MOST:
+            self.after.clear()
+        self.after[signs] = right
+
+    def known(self, point: Array) -> Array:
+        """Known vector (n_theta,)."""
+        known: Array = self.rest[: self.ends[0]].dot(point)
+        return known
+
+    def plan(self, point: Array) -> tuple[Array, Array, Array]:
+        """Known vector, decision and the multipliers of all rows."""
+        rest, (known, decided) = self.rest.dot(point), self.ends
+        multipliers = np.zeros(len(self.region.held))
+        multipliers[self.rows] = rest[decided:]
+        return rest[:known], rest[known:decided], multipliers
 
 
 class Solver:
@@ -185,7 +193,9 @@ class Laws:
     ) -> None:
         self.program, self.w, self.u, self.r_k = program, w, u, r_k
         self.knows, self.coming, self.before = knows, coming, before
-        self.sides = sides
+        self.sides, self._remembered = sides, knows.shape[1]
+        told = 0 if coming is None else coming.shape[1]
+        self._points = self._remembered + told + 1
         labels, self._equal = program.labels, program.upper - program.lower < 1e-12
         pinned = np.flatnonzero(self._equal)
         self._pinned = any(labels[i].name != "terminal" for i in pinned)
@@ -204,6 +214,15 @@ class Laws:
         parts = self.program, self.w, self.u, self.r_k, self.knows, self.coming
         return Laws, (*parts, self.before, self.sides)
 
+    def point(self, memory: Array, told: Array | None) -> Array:
+        """[memory; what ``decide`` is handed, where it matters; 1]."""
+        point = np.empty(self._points)
+        point[: self._remembered] = memory
+        if self.coming is not None:
+            point[self._remembered : -1] = told
+        point[-1] = 1.0
+        return point
+
     def of(self, held: Array) -> Law | None:
         """Law while rows (signs as of multipliers, integers) are held.
 
@@ -216,7 +235,7 @@ class Laws:
         law = None
         if found is not None and found.error <= ROUNDING:
             law = self._law(found)
-        size = 64 if law is None else law.table.nbytes + 64
+        size = 64 if law is None else law.nbytes + 64
         if len(self._kept) >= min(MOST, max(8, ROOM // size)):
             self._kept.clear()  # laws lead to one another: old ones go together
             if self.free is not None:
@@ -224,25 +243,18 @@ class Laws:
         self._kept[key] = law
         return law
 
-    def next(self, law: Law, tests: Array) -> Law | None:
-        """Known law to look at when the tests of one are not all positive.
+    def beyond(self, law: Law, tests: Array) -> Law | None:
+        """Law of the active-set step from one whose tests are not all positive.
 
-        The one that was right the last time the same tests failed, or that of the
-        active-set step.
+        None if there is no such law, or it is not known yet.
         """
-        passed = tests > 0.0
-        known = law.after.get(passed.tobytes())
-        if known is not None:
-            return known
-        rows = law.tested[~passed]
+        failed = tests <= 0.0
+        rows = law.tested[failed]
         if not rows.size or rows.min() < 0:
             return None
         held = law.region.held.copy()
-        held[rows] = law.instead[~passed]
-        other = self._kept.get(held.tobytes())
-        if other is not None:
-            self.learn(law, tests, other)
-        return other
+        held[rows] = law.instead[failed]
+        return self._kept.get(held.tobytes())
 
     def asked(self, theta: Array) -> Law | None:
         """Law of the rows that a solver holds; None where there is no such law."""
@@ -254,46 +266,44 @@ class Laws:
             return None
         return None if held is None else self.of(held)
 
-    def learn(self, law: Law, tests: Array, right: Law) -> None:
-        """Note which law to look at when the tests of another failed."""
-        if len(law.after) >= MOST:
-            law.after.clear()
-        law.after[(tests > 0.0).tobytes()] = right
-
     def _law(self, found: Region) -> Law:
         n_z, size = self.program.n_z, len(self.knows)
         z, forces = found.solution[:n_z], found.solution[n_z:]
-        u = self._first_move(found, _of(self.u, z))
+        rows = np.flatnonzero((found.held != 0) | self._equal)
         tests, tested, instead = [found.test.copy()], [found.tested], [found.instead]
         tests[0][: found.signed, -1] -= HELD
-        rows = found.tested[found.signed :]
+        inside = found.tested[found.signed :]
         # what is planned for later may miss by the slack, as in any solution
-        tests[0][found.signed :, -1] += 2.0 * self._planned[rows]
+        tests[0][found.signed :, -1] += 2.0 * self._planned[inside]
+        tests.append(np.eye(1, size + 1, size))  # where there are no others: 1
         if found.signed and self.sides is not None:
-            within = self._within(*self.sides)
-            tests.append(within)
-            tested.append(np.full(len(within), -1))
-            instead.append(np.zeros(len(within), dtype=np.int8))
-        parts = [
-            np.zeros((len(self.r_k), size + 1)) if self.w is None else _of(self.w, z),
-            u,
-            np.eye(size, size + 1),
-            z,
-            forces,
-            np.concatenate(tests),
-        ]
-        law = Law(
+            tests.append(self._within(*self.sides))
+        others = sum(map(len, tests[1:]))
+        tested.append(np.full(others, -1))
+        instead.append(np.zeros(others, dtype=np.int8))
+        if self.w is None:
+            w = np.zeros((len(self.r_k), self._points))
+            w[:, : self._remembered] = self.r_k
+        else:
+            w = self._of_point(_of(self.w, z))
+        first = np.concatenate(tests), self._first_move(found, _of(self.u, z))
+        rest = np.eye(size, size + 1), z, forces[rows]
+        return Law(
             found,
-            parts,
-            self.knows,
-            self.coming,
+            [*map(self._of_point, first), w],
+            [*map(self._of_point, rest)],
+            rows,
             np.concatenate(tested),
             np.concatenate(instead),
             found.signed > 0 or self._pinned,
         )
-        if self.w is None:
-            law.table[law.w] = self.r_k
-        return law
+
+    def _of_point(self, signal: Array) -> Array:
+        """Map of [theta; 1] as one of what ``point`` returns."""
+        parts = [signal[:, :-1] @ self.knows]
+        if self.coming is not None:
+            parts.append(signal[:, :-1] @ self.coming)
+        return np.concatenate([*parts, signal[:, -1:]], axis=1)
 
     def _first_move(self, found: Region, u: Array) -> Array:
         """u_k as a map of [theta; 1], exactly on a limit that holds it."""

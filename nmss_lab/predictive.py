@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 
@@ -64,23 +64,39 @@ NONE = _fixed(0)
 
 
 class Planned(Move):
-    """Move that a law gives; its cost is worked out when somebody asks."""
+    """Move that a law gives; what lies behind it is worked out when somebody asks."""
 
-    __slots__ = ("_cost", "program")
+    __slots__ = ("last", "point")
 
-    program: QuadraticProgram
-    _cost: Array | None
+    last: Law
+    point: Array
 
-    @property
-    def cost(self) -> Array:
-        """Optimal cost J of the sample."""
-        if self._cost is None:
-            self._cost = self.program.cost(self.decision, self.known)
-        return self._cost
+    @classmethod
+    def by(
+        cls, law: Law, last: Law, point: Array, first: Array, refused: Any
+    ) -> Planned:
+        """Make the move from what ``law.first`` gave; ``last`` is the law before."""
+        move: Planned = cls.__new__(cls)
+        move.law, move.last, move.point = law, last, point
+        move.u = first[law.u]
+        move.w = move.governed = first[law.w]
+        move.status = REFUSED if refused else LIMITED if law.limited else FREE
+        move.shift = NONE
+        return move
 
-    @cost.setter
-    def cost(self, value: Array) -> None:
-        self._cost = value
+    def __getattr__(self, name: str) -> Array:
+        """Fill in what is not there yet; only then is it asked here."""
+        law = cast(Law, self.law)
+        if name == "cost":
+            self.cost = law.region.program.cost(self.decision, self.known)
+        elif name == "iterations":
+            others = law.region.held != self.last.region.held
+            self.iterations = np.array(np.count_nonzero(others))
+        elif name in ("known", "decision", "multipliers"):
+            self.known, self.decision, self.multipliers = law.plan(self.point)
+        else:
+            raise AttributeError(name)
+        return cast(Array, getattr(self, name))
 
 
 @dataclass(frozen=True, eq=False)
@@ -329,7 +345,7 @@ class PredictiveController(Controller):
         overruled: Array = other | held.any(axis=-1, keepdims=True)
         return overruled
 
-    @property
+    @cached_property
     def follows_laws(self) -> bool:
         """Whether a single loop's move is the affine one of ``laws``."""
         return True
@@ -372,32 +388,41 @@ class PredictiveController(Controller):
         """
         if memory.vector.ndim > 1 or not self.follows_laws:
             return super().decide(memory, r, v)
-        laws, law = self.laws, memory.law
-        if law is None or law.region.program is not self.program:
+        laws, law = self.laws, memory.last.law
+        if law is None or law.program is not self.program:
             law = laws.free
+        if law is None:
+            return super().decide(memory, r, v)
         told = None
         if r is not None or v is not None or laws.coming is not None:
             told = self._handed(memory, r, v)
-        last, looks = law, LOOKS if self._switches else 0
+        point = laws.point(memory.vector, told)
+        last = wrong = law
+        begun = signs = b""
+        looks = LOOKS if self._switches else 0
         while law is not None:
-            value = law.value(memory.vector, told)
-            tests = value[law.tests]
-            if not tests.size or tests.item(tests.argmin()) > 0.0:
-                return self._planned(law, value, memory, last)
-            if looks < 0 or not self._switches:
+            first = law.first.dot(point)
+            tests = first[law.tests]
+            if tests.item(tests.argmin()) > 0.0:
+                if begun and last.after.get(begun) is not law:
+                    last.learn(begun, law)
+                    wrong.learn(signs, law)
+                return Planned.by(law, last, point, first, memory.refused)
+            if looks == 0:
                 break
-            looks, wrong = looks - 1, law
-            law = laws.next(wrong, tests) if looks > 0 else None
+            signs, wrong, looks = np.signbit(tests).tobytes(), law, looks - 1
+            begun, law = begun or signs, None
+            if looks:
+                law = wrong.after.get(signs) or laws.beyond(wrong, tests)
             if law is None:  # no known one: ask, and look once more
-                looks, law = -1, laws.asked(value[wrong.known])
-                if law is not None:
-                    laws.learn(wrong, tests, law)
+                looks, law = 0, laws.asked(wrong.known(point))
         return super().decide(memory, r, v)
 
     @cached_property
     def _handed_shape(self) -> tuple[int, int] | None:
-        """Shape of r if nothing else is handed to ``decide``."""
-        return None if self.model.n_v else (1 + self.preview, self.model.n_y)
+        """Shape of r if that is all that laws take from what is handed to them."""
+        nothing = self._from_coming is None or self.model.n_v > 0
+        return None if nothing else (1 + self.preview, self.model.n_y)
 
     def _handed(self, memory: Memory, r: Array | None, v: Array | None) -> Array:
         """Give what ``decide`` is handed in one row, for a single loop."""
@@ -408,26 +433,6 @@ class PredictiveController(Controller):
         given = self._given(as_ensemble(memory), r, v)
         row: Array = self._coming(memory.vector[None], *given)[0]
         return row
-
-    def _planned(
-        self, law: Law, value: Array, memory: Memory, last: Law | None
-    ) -> Move:
-        """Move that a law gives, after another one."""
-        w, status = value[law.w], LIMITED if law.limited else FREE
-        move = Planned(
-            value[law.u],
-            w,
-            w,
-            value[law.decision],
-            value[law.known],
-            REFUSED if memory.refused else status,
-            None,  # type: ignore[arg-type]
-            value[law.multipliers],
-            NONE if law is last or last is None else law.changes(last),
-            NONE,
-        )
-        move.program, move.law = self.program, law
-        return move
 
     def _decide(self, memory: Memory, r: Array, v: Array) -> Move:
         theta = self._known(memory.vector, r, v)
@@ -506,11 +511,12 @@ class PredictiveController(Controller):
     def _decide_limited(self, move: Move, memory: Memory, i: int) -> None:
         """Fill in row i, where the free optimum breaks a limit."""
         before = self.last_input(memory.vector[i])
-        guess = memory.decision[i], memory.multipliers[i]
+        last = memory.last
+        guess = last.decision[i], last.multipliers[i]
         solution, status = self.ranked.solve(
             move.known[i],
             self._reachable(before),
-            guess if memory.shift[i] >= 0 else None,
+            guess if last.shift[i] >= 0 else None,
         )
         if not solution.found:
             LOG.warning("%s %s", solution.status.value, solution.message)
@@ -528,12 +534,13 @@ class PredictiveController(Controller):
         A plan that knows no reference (reading "zero") leads away from it: better hold.
         """
         aimless = self.knowledge.layout.shapes["r"][0] == 0
-        if memory.shift[i] < 0 or aimless:
+        last = memory.last
+        if last.shift[i] < 0 or aimless:
             move.decision[i] = 0.0
             move.u[i], move.status[i], move.shift[i] = before, Status.HELD, -1
             return
-        move.decision[i], move.known[i] = memory.decision[i], memory.known[i]
-        move.shift[i], move.status[i] = memory.shift[i] + 1, Status.SHIFTED
+        move.decision[i], move.known[i] = last.decision[i], last.known[i]
+        move.shift[i], move.status[i] = last.shift[i] + 1, Status.SHIFTED
         step = min(int(move.shift[i]), self.horizon.Np - 1)
         u = self.signals["u"].value(move.decision[i], move.known[i])
         move.u[i] = u.reshape(self.horizon.Np, -1)[step]

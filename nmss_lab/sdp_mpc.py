@@ -413,11 +413,11 @@ class StateDependentController(PredictiveController):
 
     def _shifted_plan(self, memory: Memory, i: int) -> Array | None:
         """Shift the inputs of the last plan to this sample, its last value repeated."""
-        if memory.shift[i] < 0:
+        last, Np = memory.last, self.horizon.Np
+        if last.shift[i] < 0:
             return None
-        Np = self.horizon.Np
-        plan = memory.known[i, self._plan_layout["plan_u"]].reshape(Np, -1)
-        return plan[np.minimum(np.arange(Np) + 1 + memory.shift[i], Np - 1)]
+        plan = last.known[i, self._plan_layout["plan_u"]].reshape(Np, -1)
+        return plan[np.minimum(np.arange(Np) + 1 + last.shift[i], Np - 1)]
 
     def _clipped(self, move: Move, memory: Memory) -> Move:
         clipped = self.clip(move.u, self.last_input(memory.vector))

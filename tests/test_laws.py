@@ -145,8 +145,9 @@ def test_memory_of_another_design_brings_no_law_with_it():
     """A design may be changed while the loop runs."""
     one, other = built(), built(Limits(u=(-0.5, 0.5)))
     loop = samples(MODEL, one, SCENARIO)
-    memory = next(s.memory for s in loop if s.memory.law and s.memory.law.limited)
-    fresh = dataclasses.replace(memory, law=None)
+    memories = (sample.memory for sample in loop)
+    memory = next(m for m in memories if m.last.law and m.last.law.limited)
+    fresh = dataclasses.replace(memory, last=other.start().last)
     assert np.array_equal(other.decide(memory).u, other.decide(fresh).u)
     assert np.abs(other.decide(memory).u).max() <= 0.5
 
@@ -242,14 +243,23 @@ def test_governor_without_previews_follows_laws_too(asked):
     assert (np.abs(run.w - run.r) > 0.1).any()
 
 
-def test_cost_is_that_of_the_program():
+def test_what_lies_behind_a_move_is_that_of_the_program():
     """Though it is worked out only when asked for."""
     controller = integral_of_error(MODEL, Horizon(20, 5), 1.0, 0.1, TIGHT)
+    held, switched = np.zeros(controller.n_rows), 0
     for sample in samples(MODEL, controller, SCENARIO):
-        wanted = controller.program.cost(sample.move.decision, sample.move.known)
-        assert float(sample.move.cost) == float(wanted)
-        other = dataclasses.replace(sample.move, cost=np.array(7.0))
+        move = sample.move
+        wanted = controller.program.cost(move.decision, move.known)
+        assert float(move.cost) == float(wanted)
+        u = controller.first_move.value(move.decision, move.known)
+        assert move.u == pytest.approx(u, abs=1e-12)  # rounding of two products
+        other = dataclasses.replace(move, cost=np.array(7.0))
         assert float(other.cost) == 7.0
+        before, held = held, np.sign(move.multipliers)
+        if move.law is not None and sample.memory.last.law is not None:
+            assert int(move.iterations) == np.count_nonzero(held != before)
+            switched += int(move.iterations) > 0
+    assert switched > 3
 
 
 def test_measurement_that_is_no_number_is_said(asked):
@@ -271,6 +281,5 @@ def test_laws_are_found_by_their_rows():
     law = laws.of(held)
     assert law.limited
     assert laws.of(held) is law
-    assert float(law.changes(laws.free)) == 1
     held[rows.index(("du", 0))] = 1
     assert laws.of(held) is None

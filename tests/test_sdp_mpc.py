@@ -18,7 +18,7 @@ from test_state_dependent import MODELS, by_hand, slopes
 
 from nmss_lab import qp
 from nmss_lab.cases import case
-from nmss_lab.controller import Limits, Status
+from nmss_lab.controller import Limits, Status, stacked
 from nmss_lab.convergence import iterates
 from nmss_lab.models import DifferenceModel
 from nmss_lab.mpc import integral_of_error, wang_young
@@ -914,10 +914,7 @@ def test_many_memories_at_once_are_each_on_its_own(rng):
     """Rows of a memory with a leading axis."""
     c = moves()
     single = [c.start(y0=y, u0=REST) for y in (0.8, 1.0, 1.3)]
-    names = [part.name for part in dataclasses.fields(single[0])]
-    many = type(single[0])(
-        *(np.stack([getattr(m, name) for m in single]) for name in names)
-    )
+    many = stacked(single, np.arange(3))
     y = np.array([[0.9], [1.1], [1.2]])
     together = c.decide(c.measure(many, y, np.full((3, 1), 1.5)))
     for i, memory in enumerate(single):
