@@ -269,7 +269,8 @@ def closed_loops(
 
     All unconstrained decisions of a sample are one matrix product.  Loops whose limits
     are hit are answered from solutions that others have met, with the same active
-    limits, and only the rest by a quadratic program: see ``nmss_lab.regions``.
+    limits, and only the rest by a quadratic program: see ``nmss_lab.regions``.  One
+    plant alone runs as a single loop does.
 
     A loop that diverges does not end the others: once an output exceeds 1e9 or is not
     finite, the loop is given up.  Its outputs are nan from there on, its input stays
@@ -288,7 +289,9 @@ def closed_loops(
     ValueError
         If the plants' sizes differ or do not fit.
     """
-    return _collect(_Stacked(plants), controller, scenario, keep_moves)
+    together = _Stacked(plants)
+    found = together if len(plants) > 1 else _Only(together.plants[0])
+    return _collect(found, controller, scenario, keep_moves)
 
 
 def loops_of(
@@ -352,6 +355,7 @@ class _Single:
     """One plant of any kind; nothing of it has a leading axis."""
 
     lead: tuple[int, ...] = ()
+    gives_up = False
 
     def __init__(self, model: Plant | Equation) -> None:
         plant: Plant = model.plant() if isinstance(model, Equation) else model
@@ -371,8 +375,16 @@ class _Single:
         return inside
 
 
+class _Only(_Single):
+    """The only plant of an ensemble."""
+
+    gives_up = True
+
+
 class _Stacked:
     """Linear plants of equal size, their matrices stacked."""
+
+    gives_up = True
 
     def __init__(self, models: Sequence[LinearPlant | DifferenceModel]) -> None:
         if not models:
@@ -484,16 +496,17 @@ def _lock_step(
         inside = plants.between(state, into, plants_v[k])
         if some:
             u[given_up] = u_before[given_up]
-            move.cost[given_up], move.multipliers[given_up] = np.nan, 0.0
+            move.cost = np.where(given_up, np.nan, move.cost)
+            move.multipliers = np.where(given_up[..., None], 0.0, move.multipliers)
         yield Sample(k, y, measured, u, move, memory, inside)
         memory = controller.apply(memory, u, move, into if scenario.seen else None)
         state = plants.step(state, into, plants_v[k])
 
 
 def _diverged(plants: _Single | _Stacked, y: Array, k: int) -> Array:
-    """Which loops are to be given up, (loops,); a single loop raises."""
-    if plants.lead:
-        bounded: Array = np.all(np.abs(y) <= DIVERGED, axis=1)
+    """Which loops are to be given up, (*lead,); or an error where none may be."""
+    if plants.gives_up:
+        bounded: Array = np.all(np.abs(y) <= DIVERGED, axis=-1)
         return ~bounded
     if not np.isfinite(y).all():
         raise ValueError(f"the loop diverged: y is no longer finite at sample {k}")

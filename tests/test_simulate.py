@@ -742,6 +742,29 @@ def test_loop_that_diverges_leaves_the_others_alone(name, rng):
     assert not run.active[end:].any()
 
 
+@pytest.mark.parametrize("name", ["wang_young", "integral_of_error", "governor", "pip"])
+def test_only_loop_of_an_ensemble_is_as_any_other(name, rng):
+    """It runs as a single loop does, and may diverge as one of many."""
+    controller = build(name, TIGHT)
+    scenario = Scenario(steps(1.3, -1.3, each=40), noise=0.05 * rng.standard_normal(80))
+    for model in (MODEL, WILD):
+        alone, (first, _) = (
+            closed_loops([model] * count, controller, scenario) for count in (1, 2)
+        )
+        # a governor's wishes for a loop that has run away are rounding
+        fields = "y", "measured", "y_fine", "u", "du", *("w", "cost") * (model is MODEL)
+        for field in fields:
+            a, b = getattr(alone[0], field), getattr(first, field)
+            size = 1.0 + np.nanmax(np.abs(b))
+            assert np.allclose(a, b, rtol=0.0, atol=REPLAY * size, equal_nan=True), (
+                field
+            )
+        lost = np.isnan(first.y[:, 0])
+        assert lost.any() == (model is WILD)
+        assert np.isnan(alone[0].cost[lost]).all()
+        assert (alone[0].status[lost] >= Status.REFUSED).all()
+
+
 def _padded(plant, n_x):
     """Matrices of a plant with states that do nothing."""
     more = n_x - plant.n_x

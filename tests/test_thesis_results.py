@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import DECISION, printed
+from conftest import DECISION, ROOT, printed
 
-from nmss_lab import cases, reproduce
+from nmss_lab import cases, cli, reproduce
 from nmss_lab.analysis import linear_loop
 from nmss_lab.design import Design
 from nmss_lab.measures import steps
@@ -428,6 +428,19 @@ def test_temperature_gains(chapters_6_7: dict[str, Any]) -> None:
 def rows() -> list[reproduce.Claim]:
     """Return all rows; some programs in them have no solution on purpose."""
     return reproduce.claims()
+
+
+def test_command_prints_what_the_readme_shows(
+    rows: list[reproduce.Claim],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """``nmss-lab reproduce`` ends with how many rows came out how."""
+    monkeypatch.setattr(reproduce, "claims", lambda chapter: rows)
+    cli.main(["reproduce"])
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    shown = readme.split("$ nmss-lab reproduce\n...\n")[1].split("\n```")[0]
+    assert capsys.readouterr().out.rstrip().endswith(f"\n{shown}")
 
 
 def by_name(rows: list[reproduce.Claim], where: str, name: str) -> reproduce.Claim:
