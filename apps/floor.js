@@ -1,11 +1,14 @@
 // Plans of a building side by side, one a controller: zones in the colour of their
-// deviation from the reference, inputs at their places, the surroundings outside.
+// deviation from the reference, with dots where they are colder than it, inputs at their
+// places, the surroundings outside.
 // Data come once with the run; the player says which sample is shown.
 
 const WIDTH = 360, HEIGHT = 209, LEFT = 14, TOP = 74, METRE = 27.6
 const BAR = 88, BAR_HEIGHT = 9
 
-// Blue, white, orange: told apart by any eye; dark words are read on all of them
+// Blue, white, orange: dark words are read on all of them. The dots tell the blue from
+// the orange without colour: in grey they are alike. They are white, so that words stay
+// readable, and show the more the colder it is.
 const COLD = [90, 165, 209], EVEN = [247, 247, 247], WARM = [232, 144, 58]
 const ENDS = [-1, -0.5, 0, 0.5, 1]
 const colour = (share) => {
@@ -44,6 +47,8 @@ export function render({ model, el }) {
       group.append(none)
       return [group, () => {}]
     }
+    const dots = drawing("rect", { class: "cold", x, y: TOP, width, height, fill: `url(#${plan.dots})` })
+    wall.after(dots)
     const value = drawing("text", { class: "value", x: middle, y: TOP + 66 })
     const off = drawing("text", { class: "off", x: middle, y: TOP + 92 })
     group.append(value, off)
@@ -51,6 +56,8 @@ export function render({ model, el }) {
       const at = k * plan.outputs + part.output
       const y = run.y[at], deviation = y - plan.r[at]
       wall.setAttribute("fill", colour(deviation / plan.full))
+      const shown = deviation < 0 ? "visible" : "hidden"
+      if (dots.getAttribute("visibility") !== shown) dots.setAttribute("visibility", shown)
       words(value, fixed(y, 2))
       words(off, signed(deviation))
     }]
@@ -86,12 +93,14 @@ export function render({ model, el }) {
     const outside = drawing("text", { class: "outside", x: WIDTH / 2, y: HEIGHT - 7 })
     const hatch = drawing("pattern", { id: plan.hatch, width: 7, height: 7, patternUnits: "userSpaceOnUse", patternTransform: "rotate(45)" },
       drawing("line", { class: "hatch", x1: 0, x2: 0, y1: 0, y2: 7 }))
+    const dots = drawing("pattern", { id: plan.dots, width: 9, height: 9, patternUnits: "userSpaceOnUse", patternTransform: "rotate(45)" },
+      drawing("circle", { class: "dot", cx: 4.5, cy: 4.5, r: 2.1 }))
     const parts = [
       ...plan.zones.map((part) => zone(part, plan, run)),
       ...plan.actuators.map((part) => actuator(part, plan, run)),
     ]
     const svg = drawing("svg", { viewBox: `0 0 ${WIDTH} ${HEIGHT}`, role: "img", "aria-label": `Floor plan under ${run.name}` },
-      drawing("defs", {}, hatch),
+      drawing("defs", {}, hatch, dots),
       ...parts.map(([group]) => group),
       drawing("rect", { class: "walls", x: LEFT, y: TOP, width: plan.length * METRE, height: plan.width * METRE }),
       outside)
@@ -109,7 +118,7 @@ export function render({ model, el }) {
 
   const legend = (plan) => {
     const stops = ENDS.map((end) => `${colour(end)} ${50 + 50 * end}%`).join(", ")
-    const bar = element("div", { class: "scale" })
+    const bar = element("div", { class: "scale" }, element("div", { class: "cold" }))
     bar.style.background = `linear-gradient(to right, ${stops})`
     const marks = ENDS.map((end) => {
       const mark = element("span", {})
@@ -118,7 +127,7 @@ export function render({ model, el }) {
       return mark
     })
     const title = element("span", {})
-    title.textContent = `Deviation from the reference [${plan.unit}]`
+    title.textContent = `Deviation from the reference [${plan.unit}], colder is dotted`
     const drawn = element("span", { class: "quiet" }, "Schematic; see what this case assumes.")
     return element("div", { class: "legend" }, drawn, title, element("div", { class: "graded" }, bar, element("div", { class: "marks" }, ...marks)))
   }
@@ -132,7 +141,7 @@ export function render({ model, el }) {
     shows = []
     if (!plan.runs) { box.replaceChildren(); return }
     box.replaceChildren(
-      element("div", { class: "plans" }, ...plan.runs.map((run) => figure(run, { ...plan, hatch: `hatch${run.style}` }))),
+      element("div", { class: "plans" }, ...plan.runs.map((run) => figure(run, { ...plan, hatch: `hatch${run.style}`, dots: `dots${run.style}` }))),
       legend(plan))
     show(Math.min(last, plan.samples - 1))
   }

@@ -5,23 +5,28 @@ from __future__ import annotations
 import csv
 import functools
 import io
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
 import param
 
-from apps.session import HELD, Holding, known_case
+from apps.session import HELD, Holding, held, known_case, literal
 from nmss_lab.identify import (
     Candidate,
+    Estimate,
     Noise,
+    Orders,
     Start,
     experiment,
     multilevel,
     order_search,
     prbs,
 )
+from nmss_lab.identify.structure import is_stable
+from nmss_lab.models import Array, DifferenceModel
 from nmss_lab.records import Record, shipped
 from nmss_lab.tables import name_and_unit
 
@@ -211,9 +216,53 @@ def _is_clock(name: str) -> bool:
     return word in ("t", "time", "date", "datetime", "timestamp", "second", "")
 
 
+@dataclass(frozen=True, eq=False)
+class Spans:
+    """What models are compared on: fitted and checked part, and how the first began."""
+
+    fitted: Record
+    checked: Record
+    start: Start
+
+
+@dataclass(frozen=True, eq=False)
+class Given(Estimate):
+    """A model that was not fitted to its record, and whose uncertainty is not known.
+
+    It is simulated as fitted ones are: where they have the response to what went before
+    fitted along, so has this one.
+    """
+
+    @cached_property
+    def simulated(self) -> Array:
+        """Output of the model for the recorded inputs, (N,)."""
+        return self.explained(self.record, self.start)
+
+
+def given(model: DifferenceModel, record: Record, start: Start) -> Given:
+    """Give the model of a design, of one output, as an estimate on a record."""
+    a = np.trim_zeros(model.a[:, 0, 0], "b")
+    a = a if a.size else np.zeros(1)
+    inputs = [*model.b[:, 0].T, *model.g[:, 0].T]
+    moved = [np.flatnonzero(b) if b.any() else np.zeros(1, int) for b in inputs]
+    terms = [b[at[0] : at[-1] + 1] for b, at in zip(inputs, moved, strict=True)]
+    orders = Orders(
+        len(a), tuple(map(len, terms)), tuple(int(at[0]) + 1 for at in moved)
+    )
+    unknown = np.full((orders.count, orders.count), np.nan)
+    parameters = np.concatenate([a, *terms])
+    return Given(orders, parameters, unknown, unknown, record, "given", 0, start=start)
+
+
 class IdentifyChoices(Holding):
     """Which record, which spans of it, and which models to try."""
 
+    beside = param.ListSelector(
+        default=[],
+        objects=list(HELD),
+        label="Held designs drawn",
+        doc="Whose models are simulated beside those of the ranking.",
+    )
     record = param.Selector(
         default="gas_furnace",
         objects=list(RECORDS),
@@ -421,9 +470,35 @@ class IdentifyChoices(Holding):
         self.file: Upload | None = None
         self.take_record("gas_furnace")
 
+    @classmethod
+    def names(cls) -> list[str]:
+        """Names of all choices; which held designs are drawn is chosen with models."""
+        return [*super().names(), "beside"]
+
     def misfit(self, text: str) -> str:
-        """Held designs are not shown among models."""
-        return "this page shows models"
+        """Say why the model of a held design cannot be simulated on this record."""
+        model, names = held(text).design.model, self.whole.names
+        if not isinstance(model, DifferenceModel):
+            return "its model is state-dependent, this page shows linear ones"
+        for word, theirs, ours in (
+            ("outputs", model.n_y, 1),
+            ("inputs", model.n_u, len(names["u"])),
+            ("measured disturbances", model.n_v, len(names["v"])),
+        ):
+            if theirs != ours:
+                return f"its model has {theirs} {word}, this record has {ours}"
+        if not np.isclose(model.dt, self.whole.dt):
+            return f"it acts every {model.dt:g} s, not every {self.whole.dt:g} s"
+        if not is_stable(np.concatenate([[1.0], model.a[:, 0, 0]])):
+            return "its model is not stable, as one of a record must be"
+        return ""
+
+    def given(self, spans: Spans) -> dict[str, Given]:
+        """Models of held designs on the span that others are fitted to."""
+        return {
+            key: given(design.model, spans.fitted, spans.start)
+            for key, design in self.fitting().items()
+        }
 
     def take_record(self, name: str) -> None:
         """Choose a record and put every other choice where the record has it."""
@@ -431,7 +506,7 @@ class IdentifyChoices(Holding):
             raise ValueError(f"record = {name!r}: expected one of {tuple(RECORDS)}")
         if name == "file" and self.file is None:
             raise ValueError("no file has been uploaded on this page yet")
-        kept = {"record", "output", *HELD, *self.spans, *self.of_file}
+        kept = {"record", "output", *HELD, "beside", *self.spans, *self.of_file}
         for key in (key for key in self.names() if key not in kept):
             setattr(self, key, PRESETS[name].get(key, self.param[key].default))
         self.record = name
@@ -527,10 +602,12 @@ class IdentifyChoices(Holding):
             ("Estimation", self.est_from, self.est_to),
             ("Validation", self.val_from, self.val_to),
         ):
-            if not last > first:
+            try:
+                self.whole.select(first, last)
+            except ValueError as error:
                 raise ValueError(
                     f"{word}: from {first:g} up to {last:g} holds no sample"
-                )
+                ) from error
 
     def _load(self) -> None:
         """Read the record and put the spans in two thirds and the rest."""
@@ -629,6 +706,11 @@ class IdentifyChoices(Holding):
         """Span for validation."""
         return self.treated.select(self.val_from, self.val_to)
 
+    @property
+    def compared_on(self) -> Spans:
+        """Both spans, and what is assumed of the time before them."""
+        return Spans(self.fitted, self.checked, self.start)
+
     def _ranges(self) -> list[tuple[int, int]]:
         """First and last na, nb and nk."""
         pairs = (
@@ -706,8 +788,11 @@ class IdentifyChoices(Holding):
             return name
         return RECORDS.get(name) or WORDS.get(name, name)
 
-    def script(self, orders: str = "") -> str:
-        """Python that makes the same search and writes the chosen model."""
+    def script(self, orders: str = "", shown: Mapping[str, Given] = {}) -> str:
+        """Python that makes the same search and writes the chosen model.
+
+        Held models that are shown are checked in it, too.
+        """
         na, nb, nk = (f"range({low}, {high + 1})" for low, high in self._ranges())
         more = f"Noise({self.ar}), " if self.method == "riv" else ""
         pick = (
@@ -720,7 +805,7 @@ class IdentifyChoices(Holding):
             "output": 'record = record.detrend("first", ["y"])\n',
         }.get(self.detrend, f'record = record.detrend("{self.detrend}")\n')
         return (
-            f"{self._record_lines()}{detrend}"
+            f"{self._record_lines(bool(shown))}{detrend}"
             f"fitted = record.select({self.est_from!r}, {self.est_to!r})\n"
             f"checked = record.select({self.val_from!r}, {self.val_to!r})\n\n"
             f"found = order_search(\n    fitted, {na}, {nb}, {nk}, {more}"
@@ -729,10 +814,25 @@ class IdentifyChoices(Holding):
             f"best = {pick}\n"
             'print(best.derived(), best.validate(checked, "estimate"))\n'
             'save("model.json", best)\n'
+            f"{self._held_lines(shown)}"
         )
 
-    def _record_lines(self) -> str:
+    def _held_lines(self, shown: Mapping[str, Given]) -> str:
+        """Lines that check held models: other numbers in place of the estimate's."""
+        return "".join(
+            f"\n# {key}: {held(getattr(self, key)).words}\n"
+            f"model = replace(\n    best,\n    orders={found.orders!r},\n"
+            f"    parameters={literal(found.parameters)},\n)\n"
+            f'print(model.validate(checked, "estimate"))\n'
+            for key, found in shown.items()
+        )
+
+    def _record_lines(self, compared: bool) -> str:
+        """Lines that make the record, and imports of whatever comes later."""
         names = ["order_search", "table"] + ["Noise"] * (self.method == "riv")
+        names += ["Orders"] * compared
+        first = "from dataclasses import replace\n\n" if compared else ""
+        numbers = "import numpy as np\n\n"
         if self.record in PLANTS:
             signal = (
                 f"prbs({self.samples}, {self.clock})"
@@ -742,8 +842,7 @@ class IdentifyChoices(Holding):
             )
             names += ["experiment", "prbs" if self.signal == "prbs" else "multilevel"]
             return (
-                "import numpy as np\n\nfrom nmss_lab.cases import case\n"
-                f"{_imports(names)}\n"
+                f"{first}{numbers}from nmss_lab.cases import case\n{_imports(names)}\n"
                 f'plant = case("{PLANTS[self.record]}").plant\n'
                 f"u = {signal}\nrng = np.random.default_rng({SEED})\n"
                 f"record = experiment(plant, u, {self.noise!r}, rng, {self._moved})\n"
@@ -759,7 +858,8 @@ class IdentifyChoices(Holding):
         again = f"record = record.resample({self.whole.dt!r})\n"
         regular = self.bad == "skip_bad" or self.record == "tclab_step_test"
         return (
-            f"{_imports(names)}from nmss_lab.records import {what}\n\n"
+            f"{first}{numbers if compared else ''}{_imports(names)}"
+            f"from nmss_lab.records import {what}\n\n"
             f"record = {read}\n{again if regular else ''}"
         )
 

@@ -1,4 +1,5 @@
 // A search: its button and progress, the ranking it leaves, what is done with a row.
+// Models of held designs stand on top of the ranking, in whatever order it is.
 
 const COLUMNS = [
   ["orders", "[na nb nk]", "Orders: coefficients a, coefficients b and delay of each input"],
@@ -8,6 +9,8 @@ const COLUMNS = [
   ["checked", "R\u00b2 valid.", "R_T squared of the simulated output, on the span for validation"],
   ["problem", "Problem", "Why a row is not to be trusted"],
 ]
+
+const MOST = 3  // drawn at once
 
 const worded = (value, digits) => value === null || value === undefined
   ? "\u2013" : Number(value.toFixed(digits)).toString().replace("-", "\u2212")
@@ -28,8 +31,9 @@ export function render({ model, el }) {
   const bar = element("progress", { max: 1, value: 0, "aria-label": "Progress of the search" })
   const note = element("span", { class: "note", role: "status" })
   const head = element("tr")
+  const kept = element("tbody", { class: "held" })
   const body = element("tbody")
-  const table = element("table", {}, element("thead", {}, head), body)
+  const table = element("table", {}, element("thead", {}, head), kept, body)
   table.setAttribute("aria-label", "Ranking of models")
   const box = element("div", { class: "rows", tabindex: "0", role: "region", "aria-label": "Ranking of models" }, table)
   const empty = element("p", { class: "quiet" })
@@ -57,6 +61,36 @@ export function render({ model, el }) {
     return sign * (typeof x === "string" ? x.localeCompare(y) : x - y)
   }
 
+  const line = (row, tick, name) => {
+    const place = model.chosen.indexOf(row.id)
+    tick.checked = place >= 0
+    tick.disabled = !row.usable || (place < 0 && model.chosen.length >= MOST)
+    const mark = element("span", { class: place >= 0 ? `swatch style${place}` : "swatch" })
+    const made = element("tr", {},
+      element("th", { scope: "row" }, element("label", { class: "check" }, tick, mark, name)),
+      element("td", {}, worded(row.yic, 2)), element("td", {}, worded(row.bic, 1)),
+      element("td", {}, worded(row.r2_t, 4)), element("td", {}, worded(row.checked, 4)),
+      element("td", { class: "problem", title: row.problem }, row.problem))
+    if (row.problem) made.classList.add("bad")
+    return made
+  }
+  const found = (row) => {
+    const tick = element("input", { type: "checkbox", "data-id": row.id })
+    tick.addEventListener("change", () => {
+      const others = model.chosen.filter((id) => id !== row.id)
+      tell({ act: "choose", chosen: tick.checked ? [...others, row.id] : others })
+    })
+    return line(row, tick, row.orders)
+  }
+  const held = (row) => {
+    const tick = element("input", { type: "checkbox", "data-id": row.id })
+    tick.addEventListener("change", () => {
+      const value = [...kept.querySelectorAll("input:checked")].map((box) => box.dataset.id)
+      window.dispatchEvent(new CustomEvent("nmss-choose", { detail: { name: "beside", value } }))
+    })
+    return line(row, tick, element("span", { title: row.words }, row.orders))
+  }
+
   const fill = () => {
     const root = el.getRootNode()
     const focused = root.activeElement?.dataset?.id
@@ -64,30 +98,16 @@ export function render({ model, el }) {
       cell.ariaSort = key === order.key ? (order.down ? "descending" : "ascending") : "none"
     }
     const chosen = model.chosen
-    body.replaceChildren(...[...model.rows].sort(before).map((row) => {
-      const place = chosen.indexOf(row.id)
-      const tick = element("input", { type: "checkbox", "data-id": row.id })
-      tick.checked = place >= 0
-      tick.disabled = !row.usable || (place < 0 && chosen.length >= 3)
-      tick.addEventListener("change", () => {
-        const others = model.chosen.filter((id) => id !== row.id)
-        tell({ act: "choose", chosen: tick.checked ? [...others, row.id] : others })
-      })
-      const mark = element("span", { class: place >= 0 ? `swatch style${place}` : "swatch" })
-      const name = element("label", { class: "check" }, tick, mark, row.orders)
-      const line = element("tr", {}, element("th", { scope: "row" }, name),
-        element("td", {}, worded(row.yic, 2)), element("td", {}, worded(row.bic, 1)),
-        element("td", {}, worded(row.r2_t, 4)), element("td", {}, worded(row.checked, 4)),
-        element("td", { class: "problem", title: row.problem }, row.problem))
-      if (row.problem) line.classList.add("bad")
-      return line
-    }))
-    if (focused !== undefined) body.querySelector(`[data-id="${focused}"]`)?.focus()
-    box.hidden = model.rows.length === 0
+    kept.replaceChildren(...model.held.map(held))
+    body.replaceChildren(...[...model.rows].sort(before).map(found))
+    if (focused !== undefined) table.querySelector(`[data-id="${focused}"]`)?.focus()
+    box.hidden = model.rows.length + model.held.length === 0
     picked.replaceChildren(...chosen.map((id, place) => {
+      const mark = element("span", { class: `swatch style${place}` })
+      const design = model.held.find((one) => one.id === id)
+      if (design) return element("div", {}, mark, element("b", {}, design.orders), design.words)
       const row = model.rows.find((one) => one.id === id)
-      return element("div", {}, element("span", { class: `swatch style${place}` }),
-        element("b", {}, row?.orders ?? ""),
+      return element("div", {}, mark, element("b", {}, row?.orders ?? ""),
         button("Control it: Receding horizon", () => tell({ act: "control", id })),
         button("Govern it: Reference governor", () => tell({ act: "govern", id })),
         button("Save as JSON", () => tell({ act: "save", id })))
@@ -110,6 +130,7 @@ export function render({ model, el }) {
   }
 
   model.on("rows", fill)
+  model.on("held", fill)
   model.on("chosen", fill)
   model.on("progress", progress)
   handOver(model)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 import itertools
 import math
+import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
@@ -29,7 +30,7 @@ from nmss_lab.cases import (
 )
 from nmss_lab.controller import Limits
 from nmss_lab.design import VARYING, Design
-from nmss_lab.files import Study, dumps, loads
+from nmss_lab.files import Study, case_of, dumps, loads
 from nmss_lab.identify import Estimate
 from nmss_lab.models import DifferenceModel, LinearPlant
 from nmss_lab.mpc import STRUCTURES
@@ -44,6 +45,9 @@ MOST_RUNS = 3
 
 MOST_DECIDED = 3.3e9
 """Samples, times the cube of what the program of each decides: some ten seconds."""
+
+TRIAL = 3.0
+"""Seconds that the runs of an opened file may take: its page needs some more."""
 
 GOVERNORS = "governor", "sdp_governor"
 
@@ -94,11 +98,20 @@ def open_design(text: str) -> str:
     Raises
     ------
     ValueError
-        If the text is no such file, or holds something else than a design or a model.
+        If the text is no such file, holds something else than a design or a model, or
+        something that its page could not show.
     """
     content = loads(text)
     if isinstance(content, Estimate):
-        return f"receding_horizon?case={keep_model(content)}"
+        page, name = "receding_horizon", keep_model(content)
+    else:
+        page, name = _keep_study(content)
+    _try_out(MAKERS[page](case=name))
+    return f"{page}?case={name}"
+
+
+def _keep_study(content: Any) -> tuple[str, str]:
+    """Keep a design that can be built; return its page and the name of its case."""
     if isinstance(content, Design):
         content = Study(content)
     if not isinstance(content, Study):
@@ -106,6 +119,7 @@ def open_design(text: str) -> str:
             f"the file holds a {type(content).__name__.lower()}, expected a design or "
             "a model; records are opened on the page Identify"
         )
+    case_of(content, "content")  # can it be built?
     design = content.design
     example = design_case(design, content.plant, content.scenario)
     origin = Origin(
@@ -122,10 +136,29 @@ def open_design(text: str) -> str:
     )
     name = keep_case("opened", dumps(content), example, origin)
     if design.structure in VARYING:
-        return f"state_dependent?case={name}"
-    if design.structure in PAIR:
-        return f"governor?case={name}"
-    return f"receding_horizon?case={name}"
+        return "state_dependent", name
+    return "governor" if design.structure in PAIR else "receding_horizon", name
+
+
+def _try_out(choices: Choices) -> None:
+    """Run what a page would open with, for as long as it may take there.
+
+    Raises
+    ------
+    ValueError
+        If it takes longer, or cannot be shown.
+    """
+    until = time.monotonic() + TRIAL
+
+    def hears(share: float) -> None:
+        if time.monotonic() > until:
+            raise ValueError(
+                f"its run takes more than {TRIAL:g} s, {share:.0%} of all were done: "
+                "open a shorter scenario, or a design with shorter horizons"
+            )
+
+    choices.hears = hears
+    choices.runs()
 
 
 def plain(name: str) -> str:

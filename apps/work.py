@@ -95,10 +95,11 @@ class Lent(Executor):
     A few tasks at a time, so that the work of one session does not keep the others
     waiting; and ``withdraw`` ends whatever waits for a result at once, with a
     ``Withdrawn``, though a task that a process has begun goes on to its end.  Where a
-    process is killed, what it owed is given to new ones, once.
+    process is killed, what it owed is given to new ones, once.  The processes begin
+    with the first task, unless another pool is given.
     """
 
-    def __init__(self, pool: Executor, at_once: int = 4) -> None:
+    def __init__(self, pool: Executor | None = None, at_once: int = 4) -> None:
         self._pool, self._free = pool, at_once
         self._waiting: deque[tuple[Future[Any], Callable[[], Any]]] = deque()
         self._open: set[Future[Any]] = set()
@@ -135,6 +136,7 @@ class Lent(Executor):
                     continue
                 self._free -= 1
                 try:
+                    self._pool = self._pool or processes()
                     inner = self._pool.submit(task)
                 except RuntimeError as error:  # the pool broke, or is closed
                     inner = Future()

@@ -589,7 +589,7 @@ def record_charts(
     ----------
     record : Record
     estimates : mapping of str to Estimate, optional
-        Up to three, by name; simulated over the record each was fitted to.
+        Up to three, by name; simulated over the record that each has.
     checked : Record, optional
         Part for validation, simulated as well, its past fitted to it.
 
@@ -653,7 +653,8 @@ def estimate_charts(
     Parameters
     ----------
     estimates : mapping of str to Estimate
-        Up to three, by name.
+        Up to three, by name; without band and cloud where the covariance is not
+        finite.
     channel : int
         Input whose step and whose correlation with the residuals are shown.
     seed : int
@@ -676,7 +677,10 @@ def estimate_charts(
         _correlation_chart(
             "auto",
             "Autocorrelation of the residuals",
-            {name: found.autocorrelation(LAGS) for name, found in estimates.items()},
+            {
+                name: found.autocorrelation(_lags(found))
+                for name, found in estimates.items()
+            },
         ),
         _correlation_chart(
             "cross",
@@ -684,7 +688,7 @@ def estimate_charts(
             {
                 name: (pair[0][:, channel], pair[1])
                 for name, found in estimates.items()
-                for pair in [found.cross_correlation(LAGS)]
+                for pair in [found.cross_correlation(_lags(found))]
             },
         ),
     ]
@@ -737,9 +741,11 @@ def _step_chart(estimates: Mapping[str, Estimate], channel: int, seed: int) -> C
     t: Array = np.zeros(0)
     for style, (name, found) in enumerate(estimates.items()):
         t = found.record.dt * np.arange(samples)
-        rng = np.random.default_rng(seed)
-        low, high = step_band(found, samples, rng, channel, DRAWS)
         y = step_response(found, samples, channel)
+        low = high = None
+        if _has_spread(found):
+            rng = np.random.default_rng(seed)
+            low, high = step_band(found, samples, rng, channel, DRAWS)
         curves.append(Curve(name, t, y, style=style, low=low, high=high))
     ends = t[[0, -1]] if t.size else np.array([0.0, 1.0])
     units = {
@@ -752,6 +758,16 @@ def _step_chart(estimates: Mapping[str, Estimate], channel: int, seed: int) -> C
     return Chart("step", title, axis, tuple(curves), samples=ends)
 
 
+def _lags(found: Estimate) -> int:
+    """Lags to look at: not more than there are residuals."""
+    return min(LAGS, len(found.residuals) - 1)
+
+
+def _has_spread(found: Estimate) -> bool:
+    """Whether it is known how uncertain the parameters are."""
+    return bool(np.isfinite(found.covariance).all())
+
+
 def _settled(found: Estimate) -> int:
     """Count the samples until a step response of a stable model is at rest."""
     size = float(np.abs(found.poles()).max())
@@ -762,8 +778,10 @@ def _settled(found: Estimate) -> int:
 def _pole_chart(estimates: Mapping[str, Estimate], seed: int) -> Chart:
     curves = []
     for style, (name, found) in enumerate(estimates.items()):
-        cloud = pole_draws(found, DRAWS, np.random.default_rng(seed)).ravel()
-        p = np.concatenate([found.poles(), cloud])
+        p = found.poles()
+        if _has_spread(found):
+            cloud = pole_draws(found, DRAWS, np.random.default_rng(seed)).ravel()
+            p = np.concatenate([p, cloud])
         na = found.orders.na
         curves.append(Curve(name, p.real, p.imag, style=style, marks=na))
     left, right, half = _window(curves)

@@ -1,21 +1,27 @@
 """The bar of designs: held, carried along, undone, saved, opened, downloaded."""
 
 import contextlib
+import html
 import io
+import os
+import time
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from conftest import PATIENCE, REPLAY, Open, Server, settled, slide, watched
+from conftest import ALGEBRA, PATIENCE, REPLAY, Open, Server, settled, slide, watched
 from playwright.sync_api import Browser, Page, expect
 from test_dashboard import script_computes_what_is_shown
 
+from apps import session
+from apps.identification import IdentifyChoices, given
 from apps.pages import governor, receding_horizon
 from apps.pages.identify import IdentifyPage
-from apps.pages.live import LivePage
+from apps.pages.live import LivePage, _number
 from apps.pages.robustness import RobustnessPage
 from apps.pages.tune import TunePage
 from apps.robustness import RobustnessChoices
@@ -33,11 +39,13 @@ from apps.session import (
 from apps.varying import VaryingChoices
 from nmss_lab.cases import LINEAR_CASES, case
 from nmss_lab.cli import main
+from nmss_lab.design import Design
 from nmss_lab.files import Study, dumps, load, loads
 from nmss_lab.measures import table
+from nmss_lab.models import DifferenceModel
 from nmss_lab.predict import Horizon
 from nmss_lab.records import Record
-from nmss_lab.simulate import closed_loop
+from nmss_lab.simulate import Scenario, closed_loop
 
 # --- Held designs ---------------------------------------------------------------------
 
@@ -160,11 +168,115 @@ def test_tuned_design_is_held_exactly() -> None:
     assert page.bar.saved["text"].startswith("time [s],y1")
 
 
+def searched(page: IdentifyPage) -> None:
+    """Search, and wait until that has ended."""
+    page._begin()
+    until = time.monotonic() + 60.0
+    while page.work is not None:
+        assert time.monotonic() < until
+        time.sleep(0.01)
+
+
+def test_held_models_are_drawn_on_identify() -> None:
+    """Compared beside the first row: simulated as fitted, and in the page's link."""
+    page = IdentifyPage()
+    searched(page)
+    page._choose([0, 2])
+    first, second = page.compared.values()
+    page.bar.sent = {"act": "hold", "which": "A", "name": str(second.orders)}
+    assert page.choices.beside == []  # held, and not drawn before that is asked for
+    assert list(page.shown) == [str(first.orders), str(second.orders)]
+    page.bar.sent = {"act": "compare", "number": 2}
+    assert page.alert.object == ""
+    assert list(page.shown) == [str(first.orders), "design A"]
+    assert page.ranking.chosen == [0, "A"]
+    (row,) = page.ranking.held
+    fitted = page.ranking.rows[2]
+    assert row["checked"] == pytest.approx(fitted["checked"], rel=ALGEBRA)
+    # its past is fitted by least squares, the other's by instrumental variables
+    assert fitted["r2_t"] <= row["r2_t"] < fitted["r2_t"] + 1e-3
+    drawn = page.figures["output"].curves[1].data["y"]
+    assert np.isfinite(drawn).sum() == len(page.choices.whole.time)
+    assert len(page.figures["poles"].points[1].data["t"]) == second.orders.na
+    assert len(page.figures["step"].bands[1].data["t"]) == 0  # no uncertainty is known
+    assert f"<td>{_number(second.parameters[0])}</td>" in page.measures.object
+    again = IdentifyChoices()
+    again.accept({k: ",".join(v) if k == "beside" else v for k, v in linked(page)})
+    assert (again.A, again.beside) == (page.choices.A, ["A"])
+    page.bar.sent = {"act": "release", "which": "A", "number": 3}
+    assert list(page.shown) == [str(first.orders)]
+    assert (page.ranking.held, page.choices.beside) == ([], [])
+
+
+def linked(page: IdentifyPage) -> list[tuple[str, Any]]:
+    """Return what the link to a page states."""
+    usual = page.choices.defaults()
+    return [(k, v) for k, v in page.choices.values().items() if v != usual[k]]
+
+
+def test_identify_checks_held_models_in_python() -> None:
+    """The script prints what the ranking says of a held model, to the last digit."""
+    page = IdentifyPage()
+    searched(page)
+    page._choose([2])
+    (name,) = page.compared
+    page.bar.sent = {"act": "hold", "which": "B", "name": name, "number": 1}
+    page._choose([0])
+    page.bar.sent = {"act": "compare", "number": 2}
+    printed = io.StringIO()
+    shown = html.unescape(page.python.object.partition(">")[2].removesuffix("</pre>"))
+    with contextlib.chdir(Path(__file__).parent), contextlib.redirect_stdout(printed):
+        exec(compile(shown.replace("model.json", os.devnull), "shown", "exec"), {})
+    (row,) = page.ranking.held
+    assert float(printed.getvalue().splitlines()[-1]) == row["checked"]
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        (LoopChoices(case="wood_berry").hold("wang_young"), "2 outputs, this record"),
+        (LoopChoices(case="ifac93_6_3_3").hold("wang_young"), "not every 9 s"),
+        (VaryingChoices().hold("iterated"), "state-dependent"),
+    ],
+)
+def test_identify_says_what_does_not_fit(text: str, says: str) -> None:
+    """Other sizes, another clock, coefficients that move: in words, and not drawn."""
+    page = IdentifyPage()
+    page._put({"A": text, "beside": ["A"]})
+    assert says in page.ranking.held[0]["problem"]
+    assert not page.ranking.held[0]["usable"]
+    assert page.shown == {}
+    assert says in page.bar.told["held"]["A"]["misfit"]
+    assert page.alert.object == ""
+
+
+def test_identify_draws_no_unstable_model() -> None:
+    """An integrator has no fit to tell of: said in words."""
+    design = Design("wang_young", DifferenceModel([-1.0], [0.1], dt=9.0))
+    case = open_design(dumps(design)).partition("case=")[2]
+    page = IdentifyPage()
+    page._put({"A": held_as("case", case, "wang_young"), "beside": ["A"]})
+    assert "not stable" in page.ranking.held[0]["problem"]
+    assert page.shown == {}
+
+
+def test_models_held_elsewhere_are_simulated() -> None:
+    """Measured disturbances, delays and dead coefficients come over to the record."""
+    b = [[[0.0, 0.0]], [[0.0, 0.3]], [[0.0, 0.2]]]
+    model = DifferenceModel([-0.9, 0.0], b, [[[0.0]], [[0.4]]])
+    rng = np.random.default_rng(4)
+    u, v = rng.standard_normal((80, 2)), rng.standard_normal((80, 1))
+    y = model.simulate(u, v)
+    found = given(model, Record(np.arange(80.0), y, u, v), "rest")
+    assert str(found.orders) == "[1 1 2 1 1 2 2]"
+    assert np.abs(found.simulated - y[:, 0]).max() <= ALGEBRA * np.abs(y).max() * 80
+    assert found.r2_t == pytest.approx(1.0, abs=ALGEBRA)
+
+
 def test_held_model_controls() -> None:
     """A model held on Identify is a design on other pages."""
     page = IdentifyPage()
-    page._begin()
-    page.search.result(60)
+    searched(page)
     (name,) = page.compared
     page.bar.sent = {"act": "hold", "which": "A", "name": name, "number": 1}
     assert page.alert.object == ""
@@ -267,6 +379,59 @@ def test_broken_file_keeps_the_page() -> None:
     assert "3 MB" in page.alert.object
     page.controls.sent = {**page.choices.values(), "message": 1}
     assert page.alert.object == ""
+
+
+def dear_governor(samples: int) -> Study:
+    """Return a governor whose output limits may give way over a long horizon."""
+    example = case("governor_3_4")
+    design = example.designs["governor"]
+    limits = replace(design.limits, y=(-0.5, 0.5))
+    design = replace(design, horizon=Horizon(80, 80), limits=limits)
+    return Study(design, example.plant, Scenario(np.ones((samples, 1))))
+
+
+def unstable() -> Study:
+    """Return a design on a plant that it drives away."""
+    design = Design("wang_young", DifferenceModel([-0.9], [0.1]))
+    plant = DifferenceModel([-1.5], [-0.1]).plant()
+    return Study(design, plant, Scenario(np.ones((300, 1))))
+
+
+@pytest.mark.parametrize(
+    ("made", "says"),
+    [
+        (lambda: dear_governor(20_000), "times as long as an answer may"),
+        (unstable, "the loop is unstable"),
+        (
+            lambda: Design(
+                "pip", DifferenceModel([-0.9], [0.1]), options={"K": [[9.0, 9.0]]}
+            ),
+            "K does not stabilise the model",
+        ),
+    ],
+)
+def test_what_its_page_cannot_show_is_not_opened(made: Any, says: str) -> None:
+    """Runs beyond the budget or all bounds are refused, and the page stays."""
+    page = LivePage(receding_horizon.SUBJECT)
+    before, text = page.runs, dumps(made())
+    page.bar.sent = {"act": "open", "name": "f", "size": len(text), "text": text}
+    assert "f: " in page.alert.object
+    assert says in page.alert.object
+    assert page.runs is before
+    assert page.bar.leads == {}
+
+
+def test_long_runs_are_not_opened(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A run that is cheap by the sample, and has too many of them, is given up."""
+    design = Design("wang_young", DifferenceModel([-0.9], [0.1]))
+    long, short = (
+        dumps(Study(design, None, Scenario(np.ones((samples, 1)))))
+        for samples in (100_000, 100)
+    )
+    assert open_design(short)
+    monkeypatch.setattr(session, "TRIAL", 0.2)
+    with pytest.raises(ValueError, match=r"more than 0\.2 s, \d\d?% of all were done"):
+        open_design(long)
 
 
 def test_kept_case_that_is_gone_is_named() -> None:

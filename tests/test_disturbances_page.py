@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import ALGEBRA, DECISION, REPLAY, Open, Server, settled, slide
+from PIL import Image
 from playwright.sync_api import Page, expect
 from test_dashboard import anything, sliders
 
@@ -353,6 +354,7 @@ def written(page: Page, number: int = 0) -> dict[str, list[str]]:
             amount: of("amount").map((n) => n.textContent),
             outside: of("outside").map((n) => n.textContent),
             fill: of("zone").map((n) => n.getAttribute("fill")),
+            dotted: of("cold").map((n) => getComputedStyle(n).visibility === "visible"),
             width: of("filled").map((n) => n.getAttribute("width")),
           }
         }""",
@@ -414,7 +416,7 @@ def test_plans_show_the_sample_of_the_player(visit: Open) -> None:
 
 
 def test_colours_tell_cold_from_warm(visit: Open) -> None:
-    """A zone that is colder is blue, a warmer one orange, and the sign is written."""
+    """A zone that is colder is blue and dotted, a warmer one orange and plain."""
     page = visit(PAGE)
 
     def channels(text: str) -> list[int]:
@@ -428,6 +430,32 @@ def test_colours_tell_cold_from_warm(visit: Open) -> None:
         assert found["off"][0].startswith(sign)
         red, _, blue = channels(found["fill"][0])
         assert (blue > red) == (sign == "\u2212")
+        assert found["dotted"][0] == (sign == "\u2212")
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_grey_tells_cold_from_warm(visit: Open, scheme: Any) -> None:
+    """Without colour a colder zone has dots where no word is, and a warmer one none."""
+    page = visit(PAGE, color_scheme=scheme)
+    page.add_style_tag(content="html { filter: grayscale(1) }")
+    deviation = DisturbanceChoices(case=HALL).runs()[WITHOUT]
+    off = (deviation.y - deviation.r)[:, 0]
+    for k in (int(np.argmin(off)), int(np.argmax(off))):
+        go_to(page, k)
+        first = page.locator(".floor svg .zone").first
+        first.scroll_into_view_if_needed()
+        zone = first.bounding_box()
+        clip = {  # below the words
+            "x": zone["x"] + 4,
+            "y": zone["y"] + 0.85 * zone["height"],
+            "width": zone["width"] - 8,
+            "height": 0.12 * zone["height"],
+        }
+        shades = np.array(
+            Image.open(io.BytesIO(page.screenshot(clip=clip))).convert("L")
+        )
+        assert (np.ptp(shades) > 60) == (off[k] < 0)
+        assert off[k] < 0 or np.ptp(shades) < 5
 
 
 def test_playing_moves_the_plans_and_asks_nobody(visit: Open) -> None:

@@ -5,9 +5,12 @@ from __future__ import annotations
 import contextlib
 import io
 import json
+import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 import pytest
@@ -15,7 +18,7 @@ from conftest import ALGEBRA, Open, Server, watched
 from playwright.sync_api import Browser, Page, expect
 
 from apps.identification import LARGEST, LOOK, RECORDS, IdentifyChoices, uploaded
-from apps.pages.identify import IdentifyPage
+from apps.pages.identify import SEARCHES, IdentifyPage
 from apps.session import KEPT, LoopChoices, keep_model
 from nmss_lab.cases import model_case
 from nmss_lab.files import load
@@ -294,6 +297,140 @@ def _file(found: Any) -> str:
     return dumps(found)
 
 
+# --- The search, without a browser ---------------------------------------------------
+
+
+def ended(page: IdentifyPage) -> None:
+    """Wait until the search has ended."""
+    until = time.monotonic() + 60.0
+    while page.work is not None or page.ranking.progress["running"]:
+        assert time.monotonic() < until
+        time.sleep(0.01)
+
+
+class Paused:
+    """A search that stands still after its second fit until it is told to go on."""
+
+    def __init__(self, page: IdentifyPage) -> None:
+        self.reached, self.go_on = threading.Event(), threading.Event()
+        self.left = threading.Event()
+        job = page.choices.search()
+        page.choices.search = lambda: self._searches(job)
+        page._begin()
+        del page.choices.search
+        assert self.reached.wait(30)
+
+    def _searches(self, job: Any) -> Any:
+        def search(progress: Any) -> Any:
+            def heard(done: int, total: int) -> Any:
+                if done == 2:
+                    self.reached.set()
+                    assert self.go_on.wait(30)
+                return progress(done, total)
+
+            try:
+                return job(progress=heard)
+            finally:
+                self.left.set()
+
+        return search
+
+
+def test_cancel_keeps_what_was_fitted() -> None:
+    """Two of thirty were fitted: they are ranked, and the better one is drawn."""
+    page = IdentifyPage()
+    paused = Paused(page)
+    assert page.ranking.progress["running"]
+    page.ranking.sent = {"act": "cancel", "number": 1}
+    paused.go_on.set()
+    ended(page)
+    assert page.note.startswith("Cancelled: 2 fitted")
+    assert len(page.ranking.rows) == 2
+    assert len(page.shown) == 1
+    assert not page.ranking.progress["running"]
+
+
+def test_newer_search_supersedes() -> None:
+    """The older one is called off, and what it found is not shown."""
+    page = IdentifyPage()
+    paused = Paused(page)
+    older = page.work
+    page.choices.na_high = 1
+    page._begin()
+    assert older is not None
+    assert older.stop.is_set()
+    ended(page)
+    rows, note = page.ranking.rows, page.note
+    paused.go_on.set()
+    assert paused.left.wait(30)
+    time.sleep(0.2)
+    assert page.ranking.rows is rows
+    assert len(rows) == page.choices.tries
+    assert page.note == note
+
+
+def test_search_that_cannot_begin_leaves_the_other() -> None:
+    """Too many structures are refused while an earlier search goes on."""
+    page = IdentifyPage()
+    paused = Paused(page)
+    page.choices.accept({"na_high": 6, "nb_high": 6, "nk_high": 30})
+    page._begin()
+    assert "up to 500" in page.alert.object
+    paused.go_on.set()
+    ended(page)
+    assert len(page.ranking.rows) == 30
+
+
+def test_search_called_off_in_the_queue_is_told() -> None:
+    """It never began: nothing is ranked, and the note says so."""
+    page = IdentifyPage()
+    gate = threading.Event()
+    busy = [SEARCHES.submit(gate.wait, 30) for _ in range(SEARCHES._max_workers)]
+    page._begin()
+    assert page.note == "Waiting for its turn"
+    page.call_off()  # as a session does that closes
+    gate.set()
+    ended(page)
+    assert page.note == "Cancelled before the first fit"
+    assert page.ranking.rows == []
+    assert all(each.result(30) for each in busy)
+
+
+def test_fault_in_a_search_is_logged_and_told(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """A fault of the program ends the search in words, as a wrong record does."""
+    page = IdentifyPage()
+    for raised, says in ((KeyError("gone"), "fault"), (ValueError("odd"), "odd")):
+
+        def search(progress: Any, raised: Exception = raised) -> Any:
+            raise raised
+
+        page.choices.search = lambda search=search: search
+        page._begin()
+        ended(page)
+        assert says in page.alert.object
+        assert not page.ranking.progress["running"]
+    assert [record.exc_info[0] for record in caplog.records] == [KeyError]
+
+
+def test_short_spans_are_answered() -> None:
+    """A span without samples is refused; one of a few samples is fitted and drawn."""
+    page = IdentifyPage()
+    page._begin()
+    ended(page)
+    before = page.choices.values()
+    page.controls.sent = {**before, "val_from": 1900.0, "val_to": 1901.0, "message": 7}
+    assert "holds no sample" in page.alert.object
+    assert page.choices.values() == before
+    assert page.controls.state["message"] == 7
+    page.controls.sent = {**before, "est_to": 135.0, "message": 8}
+    page._begin()
+    ended(page)
+    assert page.alert.object == ""
+    assert page.shown
+
+
 # --- In the browser ------------------------------------------------------------------
 
 DONE = "window.nmssIdentify?.rows() > 0 && !nmssIdentify.running() && nmssForm.idle()"
@@ -384,6 +521,46 @@ def test_rows_are_sorted_and_compared(visit: Open) -> None:
         f"{drawn}.filter((r) => r.name.startsWith('band')"
         " && r.data_source.data.t.length > 0).length === 3"
     )
+
+
+def test_held_designs_in_the_ranking(visit: Open) -> None:
+    """Held models stand on top with their fit; ticked they are drawn, by the link too.
+
+    What does not fit says why, and cannot be ticked.
+    """
+    page = visit()
+    boxes = page.locator(".rows tbody:not(.held) input")
+    orders = boxes.first.locator("..").inner_text().strip()
+    page.locator("summary", has_text="A:").click()
+    page.get_by_role("button", name=f"Hold model {orders} as A").click()
+    held = page.locator(".rows tbody.held tr")
+    expect(held).to_have_count(1)
+    ours, theirs = held.first.inner_text(), ranking(page)[1]
+    assert ours.split("\t")[4] == theirs.split("\t")[4] != "\u2013"
+    held.get_by_role("checkbox").check()
+    expect(page.locator(".text-measures thead th")).to_have_count(3)
+    expect(page.locator(".text-measures")).to_contain_text("design A")
+    expect(page.locator(".picked > div")).to_have_count(2)
+    page.wait_for_function("location.search.includes('beside=A')")
+    tanks = LoopChoices(case="wood_berry").hold("wang_young")
+    address = page.evaluate("location.pathname.slice(1) + location.search")
+    again = visit(f"{address}&B={quote(tanks)}")
+    expect(again.locator(".picked > div")).to_have_count(2)
+    kept = again.locator(".rows tbody.held tr")
+    assert kept.first.inner_text() == ours
+    expect(kept.nth(1)).to_contain_text("its model has 2 outputs, this record has 1")
+    expect(kept.nth(1).get_by_role("checkbox")).to_be_disabled()
+    drawn = "Bokeh.documents[0].get_model_by_name('output').renderers"
+    again.wait_for_function(
+        f"{drawn}.filter((r) => r.name.startsWith('style')"
+        " && r.data_source.data.t.length > 0).length === 2"
+    )
+    kept.first.get_by_role("checkbox").uncheck()
+    expect(again.locator(".picked > div")).to_have_count(1)
+    again.get_by_role("button", name="A | B").click()
+    expect(again.locator(".picked > div")).to_have_count(2)
+    again.get_by_role("button", name="Undo").click()
+    expect(again.locator(".text-measures thead th")).to_have_count(3)
 
 
 def test_spans_by_mouse_and_by_keyboard(visit: Open) -> None:

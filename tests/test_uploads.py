@@ -14,6 +14,7 @@ import zipfile
 from collections.abc import Iterator
 from typing import Any
 
+import numpy as np
 import pytest
 from conftest import PATIENCE, Open, Server, watched
 from playwright.sync_api import Browser, Page, expect
@@ -22,8 +23,11 @@ from test_identify_page import DONE, ranking, table, text, upload, with_cell
 from apps.identification import LARGEST
 from apps.pages import bar
 from nmss_lab.cases import case
+from nmss_lab.design import Design
 from nmss_lab.files import Study, dumps
+from nmss_lab.models import DifferenceModel
 from nmss_lab.records import Record
+from nmss_lab.simulate import Scenario
 
 SCRIPT = "<script>window.hurt = 1</script>"
 IMAGE = "<img src=x onerror='window.hurt = 1'>"
@@ -170,6 +174,12 @@ def array(shape: list[int], dtype: str = "float64") -> dict[str, Any]:
 
 RECORD = Record([0.0, 1.0, 2.0], [[0.0], [1.0], [2.0]], [[0.0], [1.0], [1.0]])
 
+LONG = Study(
+    Design("wang_young", DifferenceModel([-0.9], [0.1])),
+    None,
+    Scenario(np.ones((100_000, 1))),
+)
+
 DESIGNS: dict[str, tuple[bytes, str]] = {
     "nothing.json": (b"", "not a JSON file"),
     "picture.json": (PICTURE, "not a JSON file"),
@@ -202,6 +212,7 @@ DESIGNS: dict[str, tuple[bytes, str]] = {
         but(horizon={"kind": "Horizon", "Np": -3, "Nc": 1}),
         "Np = -3, Nc = 1",
     ),
+    "long.json": (dumps(LONG).encode(), "open a shorter scenario"),
     f"{SCRIPT}.json": (b"{}", 'it has no "nmss_lab" version'),
 }
 """Files that hold no design that can be used, and what has to be said."""

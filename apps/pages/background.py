@@ -5,13 +5,13 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable
-from concurrent.futures import CancelledError, Future
+from concurrent.futures import CancelledError, Executor, Future
 from typing import Any
 
 import panel as pn
 
 from apps.pages.live import FAULT, KEPT
-from apps.work import WAITING, Lent, Withdrawn, processes
+from apps.work import WAITING, Lent, Withdrawn
 
 LOG = logging.getLogger(__name__)
 
@@ -20,7 +20,7 @@ class Work:
     """Work in a thread that waits for the shared processes; it can be called off."""
 
     def __init__(self) -> None:
-        self.stop, self.lent = threading.Event(), Lent(processes())
+        self.stop, self.lent = threading.Event(), Lent()
 
     def call_off(self) -> None:
         """Have it stop at once: what it has begun is of no use any more."""
@@ -55,7 +55,11 @@ class BackgroundPage:
             document.add_next_tick_callback(action)
 
     def _in_thread(
-        self, work: Work, action: Callable[[], None], ended: Callable[[str], None]
+        self,
+        work: Work,
+        action: Callable[[], None],
+        ended: Callable[[str], None],
+        threads: Executor = WAITING,
     ) -> Future[None]:
         """Do something in a thread; how it ended is told on the event loop.
 
@@ -77,7 +81,7 @@ class BackgroundPage:
                     problem = FAULT
             self._later(lambda: ended(problem))
 
-        return WAITING.submit(whole)
+        return threads.submit(whole)
 
     def _painted(self, paint: Callable[[], None]) -> None:
         """Draw; figures that are served change on the event loop only."""

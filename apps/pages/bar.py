@@ -14,8 +14,7 @@ from panel.custom import JSComponent
 
 from apps.player import STYLE, hand_over, script
 from apps.session import HELD, case_title, held, open_design, plain
-from nmss_lab.design import Design
-from nmss_lab.files import Study, case_of, dumps, loads
+from nmss_lab.files import Study, dumps
 from nmss_lab.report import report
 from nmss_lab.simulate import Run
 
@@ -198,9 +197,6 @@ class WithBar:
             )
         text = str(sent.get("text", ""))
         try:
-            content = loads(text)
-            if isinstance(content, Study | Design):
-                case_of(content, "content")  # can it be built?
             leads = open_design(text)
         except ValueError as error:
             raise ValueError(f"{name}: {error}") from error

@@ -5,12 +5,10 @@ from __future__ import annotations
 import base64
 import binascii
 import html
-import logging
 import math
-import threading
 import time
 from collections.abc import Callable, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -19,12 +17,19 @@ import param
 from bokeh.models import BoxAnnotation, Range1d
 from panel.custom import JSComponent
 
-from apps.identification import LARGEST, LOOK, RECORDS, IdentifyChoices, uploaded
-from apps.pages.background import BackgroundPage
+from apps.identification import (
+    LARGEST,
+    LOOK,
+    RECORDS,
+    Given,
+    IdentifyChoices,
+    Spans,
+    uploaded,
+)
+from apps.pages.background import BackgroundPage, Work
 from apps.pages.bar import WithBar
 from apps.pages.live import (
     ADDRESS,
-    FAULT,
     _code,
     _complaint,
     _from_address,
@@ -35,13 +40,13 @@ from apps.pages.live import (
     page_template,
 )
 from apps.player import STYLE, Controls, hand_over, script
-from apps.session import held_as, keep_model
+from apps.session import HELD, case_title, held, held_as, keep_model
 from apps.work import ends_with_the_server
-from nmss_lab.files import dumps
+from nmss_lab.files import Study, dumps
 from nmss_lab.identify import Candidate, Estimate
 from nmss_lab.plots import Chart, EstimateFigure, estimate_charts, record_charts
+from nmss_lab.records import Record
 
-LOG = logging.getLogger(__name__)
 PATH, HEADING = "identify", "Identify"
 
 PARTS = (
@@ -49,8 +54,8 @@ PARTS = (
     *("measures", "python", "upload", "controls"),
 )
 
-WORKERS = ThreadPoolExecutor(max_workers=2, thread_name_prefix="search")
-"""Searches of all sessions; more of them wait."""
+SEARCHES = ThreadPoolExecutor(max_workers=2, thread_name_prefix="search")
+"""Searches of all sessions compute here; more of them wait, and the pages do not."""
 
 TOLD_EVERY = 0.1
 """Seconds between messages of progress."""
@@ -73,11 +78,14 @@ class Upload(JSComponent):
 class Ranking(JSComponent):
     """Button and progress of a search, and a table of its rows to choose from.
 
-    ``sent`` goes to the server: what to do ("act") and with which rows.  ``saved`` is
-    a file for the browser to keep, ``leads`` an address for it to open.
+    On top of it stand ``held``, the models of designs that are held; those which are
+    ticked are told to the form by the event "nmss-choose".  ``sent`` goes to the
+    server: what to do ("act") and with which rows.  ``saved`` is a file for the browser
+    to keep, ``leads`` an address for it to open.
     """
 
     rows = param.List(default=[])
+    held = param.List(default=[])
     chosen = param.List(default=[])
     progress = param.Dict(default={})
     figures = param.Integer(default=0)
@@ -124,8 +132,9 @@ class IdentifyPage(WithRecord, WithBar, BackgroundPage):
         self.complaint = _from_address(self.choices)  # type: ignore[arg-type]
         self.found: list[Candidate] = []
         self.chosen: list[int] = []
-        self.stop = threading.Event()
-        self.search: Future[None] | None = None
+        self.spans: Spans | None = None
+        self.held: dict[str, Given] = {}
+        self.work: Work | None = None
         self.hint = self.note = ""
         self.searched: tuple[Any, ...] = ()
         self.total = 0
@@ -151,15 +160,17 @@ class IdentifyPage(WithRecord, WithBar, BackgroundPage):
         )
         self.ranking.param.watch(self._act, "sent")
         self._make_bar()
-        self._tell()
-        self._show()
+        self._weigh()
+        self._choose([])
         if self.document is not None:
             ends_with_the_server(self, self.document)
+            pn.state.on_session_destroyed(lambda _: self.call_off())
             pn.state.onload(self._begin)
 
     def call_off(self) -> None:
         """Have the search stop after the fit that is being made."""
-        self.stop.set()
+        if self.work is not None:
+            self.work.call_off()
 
     # From the form and the plot
 
@@ -167,18 +178,20 @@ class IdentifyPage(WithRecord, WithBar, BackgroundPage):
         """Take over what the form sent, show, and answer."""
         sent = dict(event.new)
         message, record = sent.pop("message", 0), self.choices.record
-        before, seen = self.choices._of_record(), self._seen
+        before, seen, beside = self.choices._of_record(), self._seen, self._beside
         self._guard(lambda: self._accept(sent), self.choices.values())
         fresh = self.choices._of_record() != before
         if fresh:
             self._forget()
-            self._show()
             if self.choices.record != "file":
                 self._begin()
+        elif self._beside != beside or (self._seen != seen and self.spans is None):
+            self._weigh()
+            self._choose(self.chosen)
+        elif self._seen != seen or self.complaint:
+            self._draw_record()
         if fresh or record != self.choices.record:
             self.controls.form = self._form()
-        if self._seen != seen or self.complaint:
-            self._draw_record()
         self._tell()
         self.ranking.progress = self._progress(0)
         self.controls.state = self._state(message)
@@ -188,19 +201,24 @@ class IdentifyPage(WithRecord, WithBar, BackgroundPage):
         """Choices that the plot of the record depends on."""
         choices = self.choices
         spans = (getattr(choices, key) for key in choices.spans)
-        return (*choices._of_record(), choices.detrend, *spans)
+        return (*choices._of_record(), choices.detrend, choices.start, *spans)
+
+    @property
+    def _beside(self) -> tuple[Any, ...]:
+        """What is held, and which of it is drawn."""
+        return (*(getattr(self.choices, key) for key in HELD), *self.choices.beside)
 
     @property
     def _asked(self) -> tuple[Any, ...]:
-        """All choices: what a ranking was asked for with."""
-        return tuple(repr(value) for value in self.choices.values().values())
+        """All choices that a ranking is asked for with."""
+        values = self.choices.values().items()
+        return tuple(repr(v) for key, v in values if key not in (*HELD, "beside"))
 
     def _take_file(self, event: Any) -> None:
         """Take over an uploaded file, or say what is wrong with it."""
         sent = dict(event.new)
         if self._guard(lambda: self._open(sent), sent.get("name")):
             self._forget()
-            self._show()
         elif self.complaint:
             self.complaint = f"{str(sent.get('name'))[:80]}: {self.complaint}"
         self._tell()
@@ -221,6 +239,8 @@ class IdentifyPage(WithRecord, WithBar, BackgroundPage):
             if right > left:
                 values = {f"{name}_from": left, f"{name}_to": right}
                 self._guard(lambda: self.choices.accept(values), values)
+                if self.spans is None:
+                    self._weigh()
                 self._tell()
                 self.ranking.progress = self._progress(0)
                 self.controls.state = self._state(1_000_000_000)
@@ -245,89 +265,106 @@ class IdentifyPage(WithRecord, WithBar, BackgroundPage):
 
     def _begin(self) -> None:
         """Start a search off the event loop; an older one is called off."""
-        self.call_off()
-        self.stop = stop = threading.Event()
         self.hint = ""
         try:
-            job, checked = self.choices.search(), self.choices.checked
+            job, spans = self.choices.search(), self.choices.compared_on
         except ValueError as error:
             self.complaint = str(error)
             self._tell()
             return
+        self.call_off()
+        self.work = work = Work()
         self.searched, self.total = self._asked, self.choices.tries
         self.note = "Waiting for its turn"
-        self.search = WORKERS.submit(self._work, stop, job, checked)
         self.ranking.progress = self._progress(0)
+        self._in_thread(
+            work,
+            lambda: self._search(work, job, spans),
+            lambda problem: self._ended(work, problem),
+            SEARCHES,
+        )
 
-    def _work(
-        self,
-        stop: threading.Event,
-        job: Callable[..., list[Candidate]],
-        checked: Any,
+    def _search(
+        self, work: Work, job: Callable[..., list[Candidate]], spans: Spans
     ) -> None:
-        """Search, in a thread of its own; what it says is said on the event loop."""
+        """Search, in a thread; what was fitted until it is called off counts."""
         told = 0.0
 
         def progress(done: int, total: int) -> bool:
             nonlocal told
             if time.monotonic() - told > TOLD_EVERY:
                 told = time.monotonic()
-                self._later(lambda: self._counted(stop, done))
+                self._later(lambda: self._counted(work, done))
             time.sleep(0)  # let the other sessions in
-            return stop.is_set()
+            return work.stop.is_set()
 
-        try:
-            found = [] if stop.is_set() else job(progress=progress)
-            rows = [_row(i, c, checked) for i, c in enumerate(found)]
-        except ValueError as error:
-            text = str(error)
-            self._later(lambda: self._failed(stop, text))
-        except Exception:
-            LOG.exception("search %s", self.choices.values())
-            self._later(lambda: self._failed(stop, FAULT))
-        else:
-            self._later(lambda: self._finished(stop, found, rows))
+        found = job(progress=progress)
+        rows = [_row(i, c, spans.checked) for i, c in enumerate(found)]
+        self._later(lambda: self._found(work, found, rows, spans))
 
-    def _counted(self, stop: threading.Event, done: int) -> None:
-        if stop is self.stop and self.search is not None:
+    def _counted(self, work: Work, done: int) -> None:
+        if work is self.work:
             self.note = f"{done} of {self.total}"
             self.ranking.progress = self._progress(done)
 
-    def _failed(self, stop: threading.Event, text: str) -> None:
-        if stop is not self.stop:
-            return
-        self.search, self.complaint = None, text
-        self.note = ""
-        self._tell()
-        self.ranking.progress = self._progress(0)
-
-    def _finished(
-        self, stop: threading.Event, found: list[Candidate], rows: list[Any]
+    def _found(
+        self, work: Work, found: list[Candidate], rows: list[Any], spans: Spans
     ) -> None:
-        if stop is not self.stop:
+        """Take over what was fitted, and draw the best of it."""
+        if work is not self.work:
             return
-        self.search = None
-        if stop.is_set() and not found:
-            self.note = "Cancelled before the first fit"
-        else:
-            self.found, self.ranking.rows = found, rows
-            good = sum(row["usable"] for row in rows)
-            word = "Cancelled: " if stop.is_set() else ""
-            self.note = f"{word}{len(rows)} fitted, {good} to be trusted"
-            self._choose([row["id"] for row in rows if row["usable"]][:1])
-        self.complaint = "" if rows else self.complaint
-        if rows and not any(row["usable"] for row in rows):
-            self.complaint = f"No structure gave a model to trust: {rows[0]['problem']}"
-        self._tell()
+        self.found, self.spans, self.ranking.rows = found, spans, rows
+        good = [row["id"] for row in rows if row["usable"]]
+        word = "Cancelled: " if work.stop.is_set() else ""
+        self.note = f"{word}{len(rows)} fitted, {len(good)} to be trusted"
+        none = f"No structure gave a model to trust: {rows[0]['problem']}"
+        self.complaint = "" if good else none
+        self._weigh()
+        self._choose(good[:1])
+        self.work = None
         self._later(self._rest)  # after the pictures
+
+    def _ended(self, work: Work, problem: str) -> None:
+        """Say why a search ended that found nothing."""
+        if work is not self.work:
+            return
+        self.work, self.complaint = None, problem or self.complaint
+        self.note = "Cancelled before the first fit" if work.stop.is_set() else ""
+        self._tell()
+        self._rest()
 
     def _rest(self) -> None:
         self.ranking.progress = self._progress(0)
 
+    def _weigh(self) -> None:
+        """Simulate held models on what the ranking was found on, or would be."""
+        choices = self.choices
+        spans = self.spans or choices.compared_on
+        with np.errstate(all="ignore"):
+            self.held = choices.given(spans)
+            self.ranking.held = [
+                {
+                    "id": key,
+                    "orders": f"design {key}",
+                    "words": _words(getattr(choices, key)),
+                    "problem": choices.misfit(getattr(choices, key)),
+                    **_figures_of(self.held.get(key), spans.checked),
+                }
+                for key in HELD
+                if getattr(choices, key)
+            ]
+
+    @property
+    def _drawn(self) -> list[str]:
+        """Held designs whose models are drawn."""
+        return [key for key in self.held if key in self.choices.beside]
+
     def _choose(self, chosen: Any) -> None:
+        """Draw rows of the ranking, as many as there is room for beside held ones."""
         usable = {row["id"] for row in self.ranking.rows if row["usable"]}
-        self.chosen = [i for i in chosen if i in usable][:MOST_COMPARED]
-        self.ranking.chosen = list(self.chosen)
+        room = MOST_COMPARED - len(self._drawn)
+        self.chosen = [i for i in chosen if i in usable][:room]
+        self.ranking.chosen = [*self.chosen, *self._drawn]
         self._show()
 
     def _give(self, act: str, which: Any) -> None:
@@ -346,10 +383,10 @@ class IdentifyPage(WithRecord, WithBar, BackgroundPage):
     def _forget(self) -> None:
         """Drop the ranking of another record."""
         self.call_off()
-        self.stop = threading.Event()
-        self.search, self.note = None, ""
-        self.found, self.chosen = [], []
-        self.ranking.rows, self.ranking.chosen = [], []
+        self.work, self.note = None, ""
+        self.found, self.spans, self.ranking.rows = [], None, []
+        self._weigh()
+        self._choose([])
         self.hint = "Nothing searched yet. Choose columns and spans, then search."
 
     # To the page
@@ -360,14 +397,21 @@ class IdentifyPage(WithRecord, WithBar, BackgroundPage):
         rows = (self.found[i] for i in self.chosen)
         return {str(c.orders): c.estimate for c in rows if c.estimate is not None}
 
+    @property
+    def shown(self) -> dict[str, Estimate]:
+        """All that is drawn: rows chosen, then what is held."""
+        return {**self.compared, **{f"design {k}": self.held[k] for k in self._drawn}}
+
     def _charts(self) -> list[Chart]:
-        checked = self.choices.checked if self.chosen else None
-        charts = record_charts(self.choices.treated, self.compared, checked)
-        return [*charts, *estimate_charts(self.compared)]
+        return [*self._record_charts(), *estimate_charts(self.shown)]
+
+    def _record_charts(self) -> list[Chart]:
+        checked = self.choices.checked if self.shown else None
+        return record_charts(self.choices.treated, self.shown, checked)
 
     def _draw_record(self) -> None:
-        checked = self.choices.checked if self.chosen else None
-        self._paint(record_charts(self.choices.treated, self.compared, checked))
+        with np.errstate(all="ignore"):
+            self._paint(self._record_charts())
 
     def _paint(self, charts: list[Chart]) -> None:
         """Draw charts; once they are served, figures change on the event loop only."""
@@ -380,10 +424,10 @@ class IdentifyPage(WithRecord, WithBar, BackgroundPage):
         self._painted(paint)
 
     def _show(self) -> None:
-        """Draw the record and the rows chosen, and say what they are."""
+        """Draw the record and what is chosen, and say what that is."""
         with np.errstate(all="ignore"):
             self._paint(self._charts())
-        self.measures.object = _parameters(self.compared)
+            self.measures.object = _parameters(self.shown)
         self._tell()
 
     def _place(self) -> None:
@@ -406,7 +450,8 @@ class IdentifyPage(WithRecord, WithBar, BackgroundPage):
         self.lead.object = _paragraph(words)
         self.alert.object = _complaint(self.complaint)
         orders = next(iter(self.compared), "")
-        self.python.object = _code(choices.script(orders))
+        drawn = {key: self.held[key] for key in self._drawn}
+        self.python.object = _code(choices.script(orders, drawn))
         self.bar.told = self._loaded()
 
     # What the bar has of this page: models, and the design that each begins with
@@ -415,10 +460,10 @@ class IdentifyPage(WithRecord, WithBar, BackgroundPage):
         return RECORDS[self.choices.record]
 
     def _shown_designs(self) -> list[str]:
-        return list(self.compared)
+        return [*self.compared, *self._drawn]
 
     def _design_named(self, name: str) -> str:
-        return f"model {name}"
+        return super()._design_named(name) if name in HELD else f"model {name}"
 
     def _files(self) -> Mapping[str, str]:
         return {"save": "File of {}"}
@@ -427,14 +472,26 @@ class IdentifyPage(WithRecord, WithBar, BackgroundPage):
         return held_as("case", keep_model(self.compared[name]), "wang_young")
 
     def _without(self, which: str) -> dict[str, Any]:
-        return {which: ""}
+        beside = [key for key in self.choices.beside if key != which]
+        return {which: "", "beside": beside}
+
+    def _side_by_side(self) -> dict[str, Any]:
+        self._choose(self.chosen[:1])
+        return {"beside": list(self.choices.fitting())}
 
     def _save_design(self, name: str) -> None:
+        if name in HELD:
+            super()._save_design(name)
+            return
         text = dumps(self.compared[name])
         hand_over(self.bar, "saved", name="model.json", text=text)
 
+    def _study(self, name: str) -> Study:
+        found = held(getattr(self.choices, name))
+        return found.choices.study_of(found.name)
+
     def _progress(self, done: int) -> dict[str, Any]:
-        running = self.search is not None
+        running = self.work is not None
         stale = bool(self.found) and not running and self.searched != self._asked
         return {
             "running": running,
@@ -483,20 +540,37 @@ def _box(name: str, color: str) -> BoxAnnotation:
     )
 
 
-def _row(number: int, candidate: Candidate, checked: Any) -> dict[str, Any]:
-    """One line of the ranking as plain data; no number is None."""
+def _row(number: int, candidate: Candidate, checked: Record) -> dict[str, Any]:
+    """One line of the ranking as plain data."""
     found, row = candidate.estimate, candidate.row
-    beyond = math.nan
-    if found is not None and found.is_good:
-        beyond = found.validate(checked, "estimate")
-    numbers = {**{key: row[key] for key in ("yic", "bic", "r2_t")}, "checked": beyond}
+    good = found if found is not None and found.is_good else None
     return {
         "id": number,
         "orders": row["orders"],
         "problem": row["problem"],
-        "usable": found is not None and found.is_good,
-        **{k: float(v) if np.isfinite(v) else None for k, v in numbers.items()},
+        **_figures_of(good, checked),
+        **{key: _plain(row[key]) for key in ("yic", "bic", "r2_t")},
     }
+
+
+def _figures_of(found: Estimate | None, checked: Record) -> dict[str, Any]:
+    """How well a model fits both spans, and whether there is one."""
+    fits = (math.nan,) * 2
+    if found is not None:
+        fits = found.r2_t, found.validate(checked, "estimate")
+    r2_t, beyond = map(_plain, fits)
+    return {"usable": found is not None, "r2_t": r2_t, "checked": beyond}
+
+
+def _plain(value: float) -> float | None:
+    """Value for the browser; no number is None."""
+    return float(value) if np.isfinite(value) else None
+
+
+def _words(text: str) -> str:
+    """Say what a held design is."""
+    found = held(text)
+    return f"{found.words}, of {case_title(found.choices.example)}"
 
 
 def _parameters(compared: Mapping[str, Estimate]) -> str:
@@ -516,6 +590,8 @@ def _parameters(compared: Mapping[str, Estimate]) -> str:
         for name in names
     )
     caption = "Parameters and what follows from them, \u00b1 one standard error from P*"
+    if any(isinstance(found, Given) for found in compared.values()):
+        caption += "; of the model of a design none is known"
     return (
         f'<p class="quiet small">{caption}</p><table><thead><tr><th>Value</th>{head}'
         f"</tr></thead><tbody>{body}</tbody></table>"
@@ -526,7 +602,7 @@ def _values(found: Estimate) -> dict[str, str]:
     errors = zip(found.parameters, found.standard_errors, strict=True)
     pairs = dict(zip(found.names, errors, strict=True)) | found.derived()
     shown = {
-        f"{name}{_unit_of(name)}": f"{_number(value)} \u00b1 {_number_short(error)}"
+        f"{name}{_unit_of(name)}": _with_error(value, error, isinstance(found, Given))
         for name, (value, error) in pairs.items()
     }
     inputs = (*found.record.names["u"], *found.record.names["v"])
@@ -534,6 +610,10 @@ def _values(found: Estimate) -> dict[str, str]:
         seconds = _number(delay * found.record.dt)
         shown[f"delay of {name}"] = f"{delay} samples, {seconds} s"
     return shown
+
+
+def _with_error(value: float, error: float, alone: bool) -> str:
+    return _number(value) + ("" if alone else f" \u00b1 {_number_short(error)}")
 
 
 def _unit_of(name: str) -> str:
@@ -548,10 +628,7 @@ def _number_short(value: float) -> str:
 
 def page() -> pn.Template:
     """Build the page for a new session."""
-    made = IdentifyPage()
-    if pn.state.curdoc is not None:
-        pn.state.on_session_destroyed(lambda _: made.call_off())
-    return made.template()
+    return IdentifyPage().template()
 
 
 __all__ = ["ADDRESS", "RECORDS", "IdentifyPage", "page"]
