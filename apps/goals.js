@@ -1,6 +1,7 @@
 // Goals as rows that can be edited, bars that show what is attained, and what is done
-// with the design found.  Rows go to the server one message at a time: the next leaves
-// when the last is answered, so that the latest rows win and nothing queues.
+// with the design found.  Messages go to the server one at a time: the next leaves when
+// the last is answered, and rows also when it is told to take a while; so the latest rows
+// win and nothing queues.
 
 const written = (value) => value === null || value === undefined || !Number.isFinite(value)
   ? "\u2013" : Number(value.toPrecision(4)).toString().replace("-", "\u2212")
@@ -8,31 +9,55 @@ const written = (value) => value === null || value === undefined || !Number.isFi
 export function render({ model, el }) {
   let rows = []        // as they are shown
   let shape = ""       // what decides which controls there are
-  let waiting = false
-  let changed = false
+  let waiting = null   // number of the message that is not answered yet
+  let changed = false  // whether rows changed since it was sent
+  let pressed = null   // and what was pressed
   let sent = 0
   let began = 0
   let parts = []       // of each row: function that shows it
   const statistics = { finished: 0, heard: 0 }  // for tests and measurements
-  const tell = (message) => { model.sent = { ...message, number: ++sent } }
-  const idle = () => !waiting && !changed
+  const idle = () => waiting === null && !changed && pressed === null
+  const tell = (message) => {
+    waiting = ++sent
+    model.sent = { ...message, number: waiting }
+  }
 
   const send = () => {
-    if (waiting) { changed = true; return }
+    if (waiting !== null && model.busy.message !== waiting) { changed = true; return }
     changed = false
-    waiting = true
     const keys = ["objective", "output", "target", "share", "tau"]
     tell({ act: "goals", rows: rows.map((row) => Object.fromEntries(keys.map((k) => [k, row[k]]))) })
   }
+  const press = (message) => {
+    if (waiting !== null) pressed = message
+    else tell(message)
+  }
   const button = (text, act, more = {}) => {
     const made = element("button", { type: "button", class: "act", ...more }, text)
-    made.addEventListener("click", () => tell(typeof act === "function" ? act() : { act }))
+    made.addEventListener("click", () => press(typeof act === "function" ? act() : { act }))
     return made
   }
 
+  // An answer that takes a while
+  const share = element("progress", { max: 1, value: 0, "aria-label": "Progress of the answer" })
+  const stay = element("button", { type: "button", class: "wide" }, "Cancel")
+  const long = element("div", { class: "long", role: "group", "aria-label": "Working" }, share, stay)
+  stay.addEventListener("click", () => {
+    changed = false
+    pressed = null
+    tell({ act: "stay" })
+  })
+  model.on("busy", () => {
+    if (model.busy.message !== waiting) return
+    share.value = model.busy.share
+    if (!long.isConnected) el.prepend(long)
+    if (changed) send()
+  })
+
   // The head: tune, progress, and what came of it
   const go = button("Tune", "tune", { class: "act main" })
-  const stop = button("Cancel", "cancel")
+  const stop = element("button", { type: "button", class: "act" }, "Cancel")
+  stop.addEventListener("click", () => { model.stop += 1 })
   const bar = element("progress", { max: 1, value: 0, "aria-label": "Designs tried" })
   const count = element("span", { class: "count" })
   const factor = element("output", { class: "factor" })
@@ -185,10 +210,16 @@ export function render({ model, el }) {
   }
 
   const take = () => {
-    const answered = model.state.answer
-    if (answered !== undefined && answered < sent && waiting) return
-    waiting = false
+    if (waiting !== null && model.state.answer < waiting) return
+    waiting = null
+    long.remove()
     if (changed) { send(); return }
+    if (pressed !== null) {
+      const message = pressed
+      pressed = null
+      tell(message)
+      return
+    }
     rows = model.state.rows.map((row) => ({ ...row }))
     layout()
   }

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 
+from apps.session import afford
 from nmss_lab.design import Design
 from nmss_lab.models import Array
-from nmss_lab.simulate import Run, closed_loops
+from nmss_lab.simulate import Run, Scenario, closed_loops
 from nmss_lab.tuning import Goal, Trial, evaluate
 
 MOST_GOALS = 8
+
+LATEST = 2
+"""Designs that a bench has tried last: a search hands them over a little later."""
 
 
 @dataclass(frozen=True)
@@ -128,6 +133,29 @@ def _aim(row: int, parts: Sequence[str], outputs: int) -> Aim:
     return Aim(parts[0], output, target, share, *tau)
 
 
+class Heard:
+    """A scenario of which somebody hears at each sample, who may end the loops.
+
+    Loops in lock step have no plant of their own that could tell; but at each sample
+    they ask for the limits of the actuator.
+    """
+
+    def __init__(self, scenario: Scenario, hears: Callable[[], None]) -> None:
+        self._scenario, self._hears = scenario, hears
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._scenario, name)
+
+    def __len__(self) -> int:
+        return len(self._scenario)
+
+    @property
+    def actuator(self) -> Any:
+        """Limits of the actuator; asked for once a sample."""
+        self._hears()
+        return self._scenario.actuator
+
+
 class Bench:
     """What designs are tried on; each is run once.
 
@@ -136,16 +164,86 @@ class Bench:
     trials : sequence of Trial
     plant : LinearPlant
         The one that pictures show.
+    start : Design
+        The one to begin with.
     """
 
-    def __init__(self, trials: Sequence[Trial], plant: Any) -> None:
-        self.trials, self.plant = list(trials), plant
+    def __init__(self, trials: Sequence[Trial], plant: Any, start: Design) -> None:
+        self.trials, self.plant, self.start = list(trials), plant, start
         self.suggested: list[Aim] = []
         self._values: dict[tuple[Design, str], float] = {}
         self._runs: dict[Design, list[Run]] = {}
 
-    def values(self, design: Design, goals: Mapping[str, Goal]) -> dict[str, float]:
+    @property
+    def samples(self) -> int:
+        """Samples of all loops of a design: those of its goals, and the one shown."""
+        plants = len(self.trials[0].all_plants)
+        return sum(len(trial.scenario) for trial in self.trials) * (plants + 1)
+
+    def prepare(
+        self,
+        goals: Mapping[Design, Mapping[str, Goal]],
+        hears: Callable[[float], None] | None = None,
+    ) -> None:
+        """Try designs, each with goals by key, as far as they are not known.
+
+        Parameters
+        ----------
+        hears : callable, optional
+            Hears which share is done, and may end it by raising.
+
+        Raises
+        ------
+        ValueError
+            If a design cannot be built or does not fit, or all would take too long.
+        """
+        new = [design for design, of in goals.items() if not self._knows(design, of)]
+        self._afford(new)
+        total, done = len(new) * self.samples, 0
+
+        def heard(loops: int) -> None:
+            nonlocal done
+            done += loops
+            if hears is not None:
+                hears(min(done / total, 1.0))
+
+        for number, design in enumerate(new):
+            done = number * self.samples  # goals may not need all trials
+            self.values(design, goals[design], heard)
+            self.runs(design, heard)
+
+    def _knows(self, design: Design, goals: Mapping[str, Goal]) -> bool:
+        known = all((design, key) in self._values for key in goals)
+        return known and design in self._runs
+
+    def _afford(self, designs: Sequence[Design]) -> None:
+        """Refuse to try designs, all of them like each, for more than some ten seconds.
+
+        Raises
+        ------
+        ValueError
+            Saying by how much, and what to lower.
+        """
+        many = len(self.trials[0].all_plants) > 1
+        for design in designs:
+            try:
+                afford({"design": design}, len(designs) * self.samples)
+            except ValueError as error:
+                fewer = ", or choose fewer plants" if many else ""
+                raise ValueError(f"{error}{fewer}") from error
+
+    def values(
+        self,
+        design: Design,
+        goals: Mapping[str, Goal],
+        heard: Callable[[int], None] | None = None,
+    ) -> dict[str, float]:
         """Objectives of a design by key, nan where one cannot be told.
+
+        Parameters
+        ----------
+        heard : callable, optional
+            Takes the number of loops that have gone on by one sample.
 
         Raises
         ------
@@ -155,32 +253,48 @@ class Bench:
         new = {k: g for k, g in goals.items() if (design, k) not in self._values}
         if new:
             with np.errstate(all="ignore"):
-                found = evaluate(design, list(new.values()), self.trials)
+                found = evaluate(design, list(new.values()), self._heard(heard))
             for key, value in zip(new, found, strict=True):
                 self._values[design, key] = float(value)
         return {key: self._values[design, key] for key in goals}
+
+    def _heard(self, heard: Callable[[int], None] | None) -> list[Trial]:
+        """Trials whose samples are heard of."""
+        if heard is None:
+            return self.trials
+        loops: Callable[[], None] = partial(heard, len(self.trials[0].all_plants))
+        return [
+            Trial(trial.plants, Heard(trial.scenario, loops))  # type: ignore[arg-type]
+            for trial in self.trials
+        ]
 
     def know(self, design: Design, values: Mapping[str, float]) -> None:
         """Take over what a search has found out already."""
         self._values |= {(design, key): value for key, value in values.items()}
 
-    def runs(self, design: Design) -> list[Run]:
-        """Run the plant that is shown, once a trial."""
+    def runs(
+        self, design: Design, heard: Callable[[int], None] | None = None
+    ) -> list[Run]:
+        """Run the plant that is shown, once a trial; for ``heard`` see ``values``."""
         if design not in self._runs:
             controller = design.build()
+            scenarios: list[Any] = [trial.scenario for trial in self.trials]
+            if heard is not None:
+                scenarios = [Heard(each, partial(heard, 1)) for each in scenarios]
             with np.errstate(all="ignore"):
                 self._runs[design] = [
-                    closed_loops([self.plant], controller, trial.scenario)[0]
-                    for trial in self.trials
+                    closed_loops([self.plant], controller, scenario)[0]
+                    for scenario in scenarios
                 ]
         return self._runs[design]
 
     def forget(self, keep: Sequence[Design]) -> None:
-        """Drop the runs of designs that are no longer shown."""
-        for design in [d for d in self._runs if d not in keep]:
+        """Drop designs that are no longer shown; the latest are about to be."""
+        for design in [d for d in list(self._runs)[:-LATEST] if d not in keep]:
             self._runs.pop(design, None)
-        for pair in [p for p in self._values if p[0] not in keep]:
-            self._values.pop(pair, None)
+        for pair in list(self._values):
+            if pair[0] not in keep and pair[0] not in self._runs:
+                self._values.pop(pair, None)
 
 
 def gain_of(text: str, n_u: int, n_x: int) -> Array:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, ClassVar
 
@@ -381,12 +381,12 @@ class TuneChoices(LoopChoices):
         Raises
         ------
         ValueError
-            If the plants cannot be drawn.
+            If the plants cannot be drawn, or the design to begin with not be built.
         """
         plants = self._drawn()
         scenarios = self._scenarios()
         trials = [Trial(plants, scenario) for scenario in scenarios]
-        return Bench(trials, self.example.plant)
+        return Bench(trials, self.example.plant, self.start())
 
     def _drawn(self) -> Any:
         model, plant = self.example.model, self.example.plant
@@ -451,18 +451,28 @@ class TuneChoices(LoopChoices):
 
     # Goals
 
-    def aims(self, bench: Bench) -> list[Aim]:
-        """Rows that were chosen, or those that suit the design to begin with."""
+    def aims(
+        self, bench: Bench, hears: Callable[[float], None] | None = None
+    ) -> list[Aim]:
+        """Rows that were chosen, or those that suit the design to begin with.
+
+        For ``hears`` see ``Bench.prepare``.
+        """
         if self.goals:
             return aims_of(self.goals, self.example.model.n_y)
         if not bench.suggested:
-            bench.suggested = self._suggested(bench)
+            bench.suggested = self._suggested(bench, hears)
         return list(bench.suggested)
 
-    def _suggested(self, bench: Bench) -> list[Aim]:
-        n_y = self.example.model.n_y
-        start = self.start()
+    def _suggested(
+        self, bench: Bench, hears: Callable[[float], None] | None
+    ) -> list[Aim]:
+        n_y, start = self.example.model.n_y, bench.start
+        first = []
         if n_y == 1:
+            first = [Aim("overshoot", 0, 0.05)]
+            if self.case == "ifac93_4_4_2":
+                first = [Aim("peak", 0, 1.0)]
             wanted = [("rise", 1.0), ("IAE", 0.8)]
             probes = [Aim(name, 0, 1.0) for name, _ in wanted]
         else:
@@ -471,16 +481,16 @@ class TuneChoices(LoopChoices):
             if self.by_step:
                 wanted += [("coupling", 0.5)] * n_y
                 probes += [Aim("coupling", i, 1.0) for i in range(n_y)]
-        now = bench.values(start, self.library(probes, bench, start))
+        goals = self.library([*first, *probes], bench, start)
+        bench.prepare({start: goals}, hears)
+        now = bench.values(start, goals)
         aims = [
             replace(probe, target=float(f"{share * now[probe.key]:.3g}"))
             for probe, (_, share) in zip(probes, wanted, strict=True)
             if np.isfinite(now[probe.key])
         ][:MOST_GOALS]
-        if n_y == 1 and self.case == "ifac93_4_4_2":
-            return [Aim("peak", 0, 1.0), *aims]
-        if n_y == 1 and np.isfinite(now["rise:0"]):
-            return [Aim("overshoot", 0, 0.05), *aims]
+        if self.case == "ifac93_4_4_2" or np.isfinite(now.get("rise:0", np.nan)):
+            return [*first, *aims]
         return aims or [Aim("smoothness", 0, 1.0)]
 
     def library(

@@ -105,6 +105,7 @@ class Lent(Executor):
         self._open: set[Future[Any]] = set()
         self._again: set[Future[Any]] = set()
         self._lock = threading.RLock()
+        self._withdrawn = False
 
     def submit(
         self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any
@@ -112,14 +113,18 @@ class Lent(Executor):
         """Put a task in the queue of this piece of work."""
         outer: Future[Any] = Future()
         with self._lock:
+            if self._withdrawn:
+                outer.set_exception(Withdrawn())
+                return outer
             self._open.add(outer)
             self._waiting.append((outer, partial(fn, *args, **kwargs)))
         self._go_on()
         return outer
 
     def withdraw(self) -> None:
-        """End the waiting for all results there are not yet."""
+        """End the waiting for all results there are not yet, and for any to come."""
         with self._lock:
+            self._withdrawn = True
             self._waiting.clear()
             given_up, self._open = self._open, set()
         for outer in given_up:

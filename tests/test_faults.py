@@ -247,7 +247,7 @@ def test_a_search_outlives_a_killed_worker(server: Server) -> None:
         await visitor.until(
             lambda: visitor.value("Goals", "progress")["tried"] > tried + 20
         )
-        await visitor.put("Goals", "sent", {"act": "cancel"})
+        await visitor.put("Goals", "stop", 1)
         await visitor.until(lambda: not visitor.value("Goals", "progress")["running"])
         assert not visitor.value("text-alert", "text")
         await visitor.close()
@@ -312,7 +312,7 @@ def test_a_search_leaves_others_their_pace(server: Server) -> None:
         await busy(server)
         beside = await pace(one)
         assert other.value("Goals", "progress")["running"]
-        await other.put("Goals", "sent", {"act": "cancel"})
+        await other.put("Goals", "stop", 1)
         await other.until(lambda: not other.value("Goals", "progress")["running"])
         again = await pace(one)
         await one.close()

@@ -6,20 +6,26 @@ import contextlib
 import io
 import json
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from conftest import ALGEBRA, REPLAY, Open, Server, watched
 from playwright.sync_api import Browser, Page, expect
+from visitors import Visitor, run
 
 from apps.goals import KINDS, MOST_GOALS, Aim, aims_of, gain_of
+from apps.pages.background import Work
+from apps.pages.live import KEPT as KEPT_HERE
 from apps.pages.tune import TunePage
 from apps.session import KEPT, LoopChoices
 from apps.tuning import TuneChoices, first_order
 from apps.weight_tables import parts_of
+from apps.work import Withdrawn
 from nmss_lab.cases import shell_desired, shell_step
 from nmss_lab.design import Design
 from nmss_lab.files import load
@@ -242,8 +248,8 @@ def test_tuned_designs_open_on_the_other_page() -> None:
     runs = there.runs()
     assert np.array_equal(runs["tuned"].y, here.y)  # weights along keep their horizon
     names = _run(there.script())
-    for key, run in runs.items():
-        assert np.array_equal(names["runs"][key].y, run.y)
+    for key, one in runs.items():
+        assert np.array_equal(names["runs"][key].y, one.y)
     again = TuneChoices(case=name, **FEW)
     assert again.structure == "tuned"
     assert again.aims(again.bench())
@@ -281,7 +287,7 @@ def test_a_session_without_a_browser() -> None:
         page.goals.sent = {"act": act, "number": act_number(), **more}
 
     act("tune")
-    assert page.work is None or page.work.result(timeout=120) is None
+    assert page.running is None or page.running.result(timeout=120) is None
     assert page.complaint == ""
     tuned = page.place.after
     assert isinstance(tuned, Design)
@@ -296,7 +302,7 @@ def test_a_session_without_a_browser() -> None:
     act("undo")
     assert "nothing to undo" in page.complaint
     act("match", text="2, 0.1, -0.5")
-    assert page.work is None or page.work.result(timeout=120) is None
+    assert page.running is None or page.running.result(timeout=120) is None
     assert "relative distance" in page.matched
     page.choices.view = "compare"
     assert list(page._designs()) == ["A", "present"]
@@ -321,17 +327,19 @@ def test_a_stopped_search_reports_what_it_has() -> None:
     """Cancelling ends with the best so far; a search called off leaves no trace."""
     page = TunePage()
     heard = page.goals.param.watch(
-        lambda event: page.stop.set() if event.new["tried"] > 5 else None, "progress"
+        lambda event: event.new["tried"] < 6 or page.stopping or page._cancel(event),
+        "progress",
     )
     page.goals.sent = {"act": "tune", "number": act_number()}
-    assert page.work is None or page.work.result(timeout=120) is None
+    assert page.running is None or page.running.result(timeout=120) is None
     page.goals.param.unwatch(heard)
     assert page.place.after is not None
     assert "Cancelled" in page.place.note
     assert page.goals.progress["attainment"] < 0.25
     before = page.place
-    page._heard(page.stop, None, 3)
-    page._failed(_other_stop(), "late")
+    assert page.work is not None
+    page._heard(page.work, None, 3)
+    page._ended(Work(), "late", [], lambda found: None)
     assert page.place is before
     assert page.complaint == ""
 
@@ -360,8 +368,66 @@ def test_choices_that_cannot_be_built_change_nothing(
     assert page.complaint == ""
 
 
-def _other_stop() -> Any:
-    return type("Stop", (), {"is_set": lambda self: True})()
+MANY = {"plants": "ranges", "drawn": 40, "limit_y": "own"}
+"""Plants whose limits give way: gasifiers take seconds."""
+
+
+def test_a_bench_tells_how_far_it_is_and_can_be_ended() -> None:
+    """The share grows at each sample up to all of it; whoever hears may end it."""
+    choices, shares = TuneChoices(plants="ranges", drawn=3), list[float]()
+    bench = choices.bench()
+    goals = choices.library([Aim("IAE", 0, 1.0)], bench, bench.start)
+    asked = {bench.start: goals, choices.start(): goals}
+    bench.prepare(asked, shares.append)
+    assert shares == sorted(shares)
+    assert shares[-1] == 1.0
+    assert len(shares) == 2 * 2 * len(bench.trials[0].scenario)
+    bench.prepare(asked, shares.append)
+    assert len(shares) == 2 * 2 * len(bench.trials[0].scenario)  # nothing was new
+    plain = choices.bench()
+    assert plain.values(plain.start, goals) == bench.values(bench.start, goals)
+
+    def end(share: float) -> None:
+        if share > 0.4:
+            raise Withdrawn
+
+    with pytest.raises(Withdrawn):
+        plain.prepare({choices.start(): goals}, end)
+
+
+def test_what_a_bench_cannot_afford_is_refused() -> None:
+    """Horizons, samples and plants have a budget; the page keeps what it shows."""
+    page = TunePage()
+    page.controls.sent = {**page.choices.values(), "case": "shell_5_3_2", "message": 1}
+    values, place = page.choices.values(), page.place
+    pictures = page.figures["output"].curves[0].data, page.measures.object
+    wanted = {"Np": 80, "Nc": 30, "length": 400, **MANY}
+    page.controls.sent = {**values, **wanted, "message": 2}
+    assert page.controls.state["message"] == 2
+    for words in ("50400 samples", "lower Np to 13", "choose fewer plants", KEPT_HERE):
+        assert words in page.complaint
+    assert page.choices.values() == values
+    assert page.place is place
+    now = page.figures["output"].curves[0].data, page.measures.object
+    assert now == pictures
+    page.controls.sent = {**values, "length": 60, "message": 3}
+    assert page.complaint == ""
+
+
+def test_what_is_found_waits_for_an_answer_but_keeps_no_event_loop() -> None:
+    """While an answer is under way, a result is looked at again a little later."""
+    page, done = TunePage(), list[str]()
+    later = list[Any]()
+    page.document = SimpleNamespace(  # type: ignore[assignment]
+        session_context=True,
+        add_timeout_callback=lambda action, after: later.append(action),
+    )
+    with page.lock, ThreadPoolExecutor(1) as loop:
+        loop.submit(page._when_free, lambda: done.append("it")).result(timeout=10)
+        assert not done
+    later.pop()()
+    assert done == ["it"]
+    assert not later
 
 
 def test_a_step_without_a_finite_value_has_no_picture() -> None:
@@ -369,7 +435,7 @@ def test_a_step_without_a_finite_value_has_no_picture() -> None:
     page = TunePage()
     job = page.choices.job(page.place.before, page._aims(), page.bench)
     step = Step(1, np.inf, np.full(3, np.nan), {})
-    page._picture(page.stop, job, step, ["a", "b", "c"], page.bench)
+    page._picture(Work(), job, step, ["a", "b", "c"], page.bench)
     assert page.live is None
 
 
@@ -383,6 +449,80 @@ def visit(server: Server, browser: Browser) -> Iterator[Open]:
     """Yield a function that opens the page; nothing may complain or call away."""
     with watched(server, browser, READY, "tune") as open_page:
         yield open_page
+
+
+def test_a_long_answer_gives_way(server: Server) -> None:
+    """Of form and rows: each tells how far it is; the next, or a cancel, is answered.
+
+    While a search goes on, the page answers, too.
+    """
+
+    async def visit() -> None:
+        visitor = await Visitor.open(server.url, "tune?case=gasifier_6_3_4&drawn=40")
+        first = visitor.value("Controls", "state")["values"]
+
+        def busy(component: str, message: int) -> bool:
+            told = visitor.value(component, "busy") or {"message": 0}
+            return bool(told["message"] == message and 0.0 < told["share"] < 1.0)
+
+        def said() -> str:
+            return visitor.value("text-alert", "text") or ""
+
+        async def ask(component: str, message: int, **more: Any) -> None:
+            number = {"Controls": "message", "Goals": "number"}[component]
+            await visitor.put(component, "sent", {**more, number: message})
+
+        async def answered(component: str, message: int) -> None:
+            key = {"Controls": "message", "Goals": "answer"}[component]
+            await visitor.until(
+                lambda: visitor.value(component, "state").get(key) == message
+            )
+
+        many = {**first, "plants": "ranges"}
+        measures = visitor.value("text-measures", "text")
+        await ask("Controls", 1, **many)
+        await visitor.until(lambda: busy("Controls", 1))
+        await ask("Controls", 2, **{**first, "seed": 7})
+        await answered("Controls", 2)
+        assert visitor.value("Controls", "state")["values"] == {**first, "seed": 7}
+        assert not said()
+        await ask("Controls", 3, **many)
+        await visitor.until(lambda: busy("Controls", 3))
+        await ask("Controls", 4, cancel=True)
+        await answered("Controls", 4)
+        assert visitor.value("Controls", "state")["values"] == {**first, "seed": 7}
+        assert "Cancelled." in said()
+        assert KEPT_HERE in said()
+        assert visitor.value("text-measures", "text") == measures
+
+        await ask("Controls", 5, **{**many, "drawn": 10})
+        await answered("Controls", 5)
+        assert not said()
+        await ask("Goals", 1, act="tune")
+        await visitor.until(lambda: visitor.value("Goals", "progress")["running"])
+        rows = visitor.value("Goals", "state")["rows"]
+        other = [{**rows[0], "objective": "effort", "target": None}]
+        await ask("Goals", 2, act="goals", rows=other)
+        await visitor.until(lambda: busy("Goals", 2))
+        harder = [{**rows[0], "target": 0.5 * rows[0]["target"]}]
+        await ask("Goals", 3, act="goals", rows=harder)
+        await answered("Goals", 3)
+        (row,) = visitor.value("Goals", "state")["rows"]
+        assert row["objective"] == rows[0]["objective"]
+        assert row["target"] == pytest.approx(harder[0]["target"], rel=1e-5)
+        assert not said()
+        await ask("Goals", 4, act="goals", rows=other)
+        await visitor.until(lambda: busy("Goals", 4))
+        await ask("Goals", 5, act="stay")
+        await answered("Goals", 5)
+        await visitor.until(lambda: "Cancelled." in said())
+        assert visitor.value("Goals", "state")["rows"] == [row]
+        assert visitor.value("Goals", "progress")["running"]
+        await visitor.put("Goals", "stop", 1)
+        await visitor.until(lambda: not visitor.value("Goals", "progress")["running"])
+        await visitor.close()
+
+    run(visit())
 
 
 def press(page: Page, name: str) -> None:
@@ -490,6 +630,8 @@ def hold(page: Page, which: str, name: str) -> None:
     """Hold a design by the menu of the bar."""
     page.locator("summary", has_text=f"{which}:").click()
     page.get_by_role("button", name=f"{name} as {which}").click()
+    held = page.locator("summary", has_text=f"{which}:")
+    expect(held).not_to_contain_text("empty")
     page.wait_for_function(READY)
 
 

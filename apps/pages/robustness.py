@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import html
-import logging
 import math
-import threading
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
@@ -19,10 +17,9 @@ import param
 from bokeh.models import Range1d
 from panel.custom import JSComponent
 
-from apps.pages.background import BackgroundPage
+from apps.pages.background import BackgroundPage, Work
 from apps.pages.bar import WithBar
 from apps.pages.live import (
-    FAULT,
     WithForm,
     _code,
     _complaint,
@@ -43,14 +40,7 @@ from apps.robustness import (
     centre,
 )
 from apps.session import plain
-from apps.work import (
-    WAITING,
-    Lent,
-    Withdrawn,
-    ends_with_the_server,
-    get_ready,
-    processes,
-)
+from apps.work import ends_with_the_server, get_ready
 from nmss_lab.analysis import linear_loop
 from nmss_lab.models import Array
 from nmss_lab.montecarlo import MonteCarlo, join, monte_carlo_parts
@@ -67,7 +57,6 @@ from nmss_lab.plots import (
 from nmss_lab.simulate import Run, closed_loop
 from nmss_lab.uncertainty import Bounds, uncertainty_bounds
 
-LOG = logging.getLogger(__name__)
 PATH, HEADING = "robustness", "Robustness"
 
 PARTS = (
@@ -148,8 +137,7 @@ class Job:
     choices: RobustnessChoices
     study: Study
     lines: tuple[str, ...]
-    stop: threading.Event
-    lent: Lent
+    work: Work
     nominal: dict[str, Run]
     poles: dict[str, Array]
 
@@ -166,6 +154,7 @@ class RobustnessPage(WithForm, WithBar, BackgroundPage):
         self.found: MonteCarlo | None = None
         self.done, self.note, self.picked = 0, "", -1
         self.loci: dict[tuple[Any, ...], tuple[dict[str, Array], list[Bounds]]] = {}
+        self.walking: tuple[tuple[Any, ...], Work] | None = None
         self.lead, self.alert, self.told, self.python, self.notes = (
             _text(name) for name in ("lead", "alert", "told", "python", "notes")
         )
@@ -190,10 +179,14 @@ class RobustnessPage(WithForm, WithBar, BackgroundPage):
             pn.state.onload(self._open)
 
     def call_off(self) -> None:
-        """Have the study stop at once."""
+        """Have study and walk stop at once; realisations that are done are kept."""
+        self._cancel()
+        if self.walking is not None:
+            self.walking[1].call_off()
+
+    def _cancel(self) -> None:
         if self.job is not None:
-            self.job.stop.set()
-            self.job.lent.withdraw()
+            self.job.work.call_off()
 
     # From the form
 
@@ -261,7 +254,7 @@ class RobustnessPage(WithForm, WithBar, BackgroundPage):
         sent = dict(event.new)
         actions: dict[str, Callable[[], None]] = {
             "run": self._begin,
-            "cancel": self.call_off,
+            "cancel": self._cancel,
             "pick": lambda: self._pick(int(sent["number"])),
             "unpick": lambda: self._pick(-1),
             "open": self._give,
@@ -278,91 +271,78 @@ class RobustnessPage(WithForm, WithBar, BackgroundPage):
         choices = RobustnessChoices(**self.choices.values())
         study, lines = choices.study(), tuple(choices.study_lines())
         self._forget()
-        job = Job(choices, study, lines, threading.Event(), Lent(processes()), {}, {})
+        job = Job(choices, study, lines, Work(), {}, {})
         self.job, self.note = job, "Waiting for its turn"
-        self.running = WAITING.submit(self._work, job)
+        self.running = self._in_thread(
+            job.work,
+            lambda: self._work(job),
+            lambda problem: self._finished(job, problem),
+        )
         self.panel.progress = self._progress()
 
     def _work(self, job: Job) -> None:
-        """Study, in a thread of its own; what it finds is shown on the event loop."""
-        study, parts, problem = job.study, [], ""
+        """Study, in a thread; what it finds is shown on the event loop."""
+        parts: list[MonteCarlo] = []
         told, drawn = time.monotonic(), 0
+        _run_nominal(job)
+        job.work.check()
         try:
-            if not job.stop.is_set():
-                _run_nominal(job)
-            for part in [] if job.stop.is_set() else _parts(job):
+            for part in _parts(job):
                 parts.append(part)
-                if job.stop.is_set():
-                    break
+                job.work.check()
                 done = sum(map(len, parts))
-                if time.monotonic() - told < TOLD_EVERY or done == study.n:
+                if time.monotonic() - told < TOLD_EVERY or done == job.study.n:
                     continue
                 if done >= GROWN * drawn:
                     drawn = done
-                    self._hand_over(job, join(parts), last=False)
+                    self._hand_over(job, join(parts))
                 else:
                     self._later(partial(self._counted, job, done))
                 told = time.monotonic()
-        except Withdrawn:
-            pass  # what there is is kept
-        except ValueError as error:
-            problem = str(error)
-        except Exception:
-            LOG.exception("study %s", job.choices.values())
-            problem = FAULT
-        found = join(parts) if parts else None
-        self._hand_over(job, found, True, problem)
+        finally:  # what there is is kept, however it ends
+            if parts:
+                self._hand_over(job, join(parts))
 
     def _counted(self, job: Job, done: int) -> None:
         if job is self.job and self.running is not None:
             self.done, self.note = done, ""
             self.panel.progress = self._progress()
 
-    def _hand_over(
-        self, job: Job, found: MonteCarlo | None, last: bool, problem: str = ""
-    ) -> None:
+    def _hand_over(self, job: Job, found: MonteCarlo) -> None:
         """Draw in this thread what the event loop then shows."""
-        if job is not self.job:
-            return
-        view = self._view()
-        try:
-            charts = self._charts(job, found, view) if found is not None else []
-        except Exception:
-            LOG.exception("charts %s", job.choices.values())
-            charts, problem = [], FAULT
-        self._later(lambda: self._grown(job, found, charts, view, last, problem))
+        if job is self.job:
+            view = self._view()
+            charts = self._charts(job, found, view)
+            self._later(lambda: self._grown(job, found, charts, view))
 
     def _grown(
-        self,
-        job: Job,
-        found: MonteCarlo | None,
-        charts: list[Chart],
-        view: View,
-        last: bool,
-        problem: str,
+        self, job: Job, found: MonteCarlo, charts: list[Chart], view: View
     ) -> None:
         """Show what there is of a study."""
         if job is not self.job:
             return
-        if found is not None:
-            self.found, self.done = found, len(found)
-        if last:
-            self.running = None
-            self.complaint = problem or self.complaint
-            self.note = self._ended(job)
-        else:
-            self.note = ""
-        if charts and view == self._view():
+        self.found, self.done, self.note = found, len(found), ""
+        if view == self._view():
             self._paint(charts)
-        elif found is not None:
+        else:
             self._show()
         self._tabulate()
         self._tell()
         self._later(self._count_on)  # after the pictures
 
+    def _finished(self, job: Job, problem: str) -> None:
+        """Say how a study ended."""
+        if job is not self.job:
+            return
+        self.running = None
+        self.complaint = problem or self.complaint
+        self.note = self._ended(job)
+        self._tell()
+        self._later(self._count_on)
+
     def _ended(self, job: Job) -> str:
         if self.found is None:
-            return "Cancelled before the first part was done" * job.stop.is_set()
+            return "Cancelled before the first part was done" * job.work.stop.is_set()
         if len(self.found) < job.study.n:
             return f"Cancelled: {len(self.found):,} of {job.study.n:,} kept"
         return f"{job.study.n:,} realisations"
@@ -373,7 +353,7 @@ class RobustnessPage(WithForm, WithBar, BackgroundPage):
     def _forget(self) -> None:
         """Call off and drop the study of other choices."""
         self.call_off()
-        self.job, self.running, self.found = None, None, None
+        self.job, self.running, self.found, self.walking = None, None, None, None
         self.note, self.done, self.picked = "", 0, -1
         self.panel.rates, self.panel.worst, self.panel.picked = {}, [], {}
 
@@ -460,7 +440,7 @@ class RobustnessPage(WithForm, WithBar, BackgroundPage):
         assert job is not None
         key = (letter, job.lines)
         if key not in self.loci:
-            WAITING.submit(self._walk, job, letter, key)
+            self._begin_walk(job, key)
             return []
         loci, bounds = self.loci[key]
         at = {
@@ -470,40 +450,55 @@ class RobustnessPage(WithForm, WithBar, BackgroundPage):
         of = f"factor on {letter} from {FACTORS[0]:g} to {FACTORS[-1]:g}"
         return [locus_chart(loci, at, of)]
 
-    def _walk(self, job: Job, letter: str, key: tuple[Any, ...]) -> None:
-        """Walk, in a thread of its own."""
-        try:
-            model = job.choices.example.model
-            side = {"b": "numerator", "a": "denominator"}[letter]
-            loci, bounds = {}, []
-            for name, design in job.study.designs.items():
-                controller = design.build()
-                walked = [model.varied(**{side: f}) for f in FACTORS.tolist()]
-                loci[name] = np.stack(
-                    [linear_loop(controller, plant).poles for plant in walked]
-                )
-                if job.stop.is_set() and job is not self.job:
-                    return
-                bounds.append(
-                    uncertainty_bounds(
-                        controller,
-                        lambda factor: model.varied(**{side: factor}),
-                        CIRCLE,
-                        0.005,
-                        (float(FACTORS[0]), float(FACTORS[-1])),
-                    )
-                )
-        except Exception:
-            LOG.exception("walk %s", job.choices.values())
-            return
-        self._later(lambda: self._walked(job, key, (loci, bounds)))
+    def _begin_walk(self, job: Job, key: tuple[Any, ...]) -> None:
+        """Walk in the background, unless that walk has begun; an older one ends."""
+        if self.walking is not None:
+            if self.walking[0] == key:
+                return
+            self.walking[1].call_off()
+        work = Work()
+        self.walking = key, work
+        self._in_thread(
+            work,
+            lambda: self._walk(work, job, key),
+            lambda problem: self._walk_ended(work, problem),
+        )
 
-    def _walked(self, job: Job, key: tuple[Any, ...], walk: Any) -> None:
-        if job is self.job:
+    def _walk(self, work: Work, job: Job, key: tuple[Any, ...]) -> None:
+        """Walk, in a thread."""
+        model = job.choices.example.model
+        side = {"b": "numerator", "a": "denominator"}[key[0]]
+        loci, bounds = {}, []
+        for name, design in job.study.designs.items():
+            controller = design.build()
+            walked = [model.varied(**{side: f}) for f in FACTORS.tolist()]
+            loci[name] = np.stack(
+                [linear_loop(controller, plant).poles for plant in walked]
+            )
+            work.check()
+            bounds.append(
+                uncertainty_bounds(
+                    controller,
+                    lambda factor: model.varied(**{side: factor}),
+                    CIRCLE,
+                    0.005,
+                    (float(FACTORS[0]), float(FACTORS[-1])),
+                )
+            )
+        self._later(lambda: self._walked(work, key, (loci, bounds)))
+
+    def _walked(self, work: Work, key: tuple[Any, ...], walk: Any) -> None:
+        if self.walking == (key, work):
             self.loci = {**dict(list(self.loci.items())[-3:]), key: walk}
             if self.choices.cloud == key[0]:
                 self._paint([])
                 self._tell()
+
+    def _walk_ended(self, work: Work, problem: str) -> None:
+        if self.walking is not None and self.walking[1] is work:
+            self.walking = None
+            self.complaint = problem or self.complaint
+            self._tell()
 
     # One realisation
 
@@ -696,7 +691,7 @@ def _parts(job: Job) -> Any:
         study.n,
         study.seed,
         keep="signals",
-        executor=job.lent,
+        executor=job.work.lent,
     )
 
 

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import html
-import logging
 import math
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import CancelledError, Future
+from concurrent.futures import Future
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import panel as pn
@@ -20,11 +19,9 @@ from panel.custom import JSComponent
 
 from apps.coupling import Coupling, cells
 from apps.goals import KINDS, MOST_GOALS, Aim, Bench, aims_of, gain_of
-from apps.pages.background import BackgroundPage
+from apps.pages.background import BackgroundPage, Work
 from apps.pages.bar import WithBar
 from apps.pages.live import (
-    ADDRESS,
-    FAULT,
     WithForm,
     _code,
     _complaint,
@@ -39,7 +36,7 @@ from apps.player import STYLE, Controls, hand_over, script
 from apps.session import HELD, held, held_as, plain
 from apps.tuning import LOOK, OTHERWISE, TuneChoices
 from apps.weight_tables import weight_table
-from apps.work import WAITING, Lent, ends_with_the_server, get_ready, processes
+from apps.work import Withdrawn, ends_with_the_server, get_ready
 from nmss_lab.design import Design
 from nmss_lab.files import Study
 from nmss_lab.matching import Match, match
@@ -50,7 +47,8 @@ from nmss_lab.plots import Chart, ChartFigure, history_chart, loop_charts
 from nmss_lab.simulate import Run
 from nmss_lab.tuning import Step, Tuned, attained, tune
 
-LOG = logging.getLogger(__name__)
+Found = TypeVar("Found")
+
 PATH, HEADING = "tune", "Tune"
 
 PARTS = (
@@ -61,8 +59,13 @@ PARTS = (
 TOLD_EVERY = 0.2
 """Seconds between pictures of the best so far."""
 
+LOOK_AGAIN = 50
+"""Milliseconds until what has been found is taken over, if an answer is under way."""
+
 MATCH_EVALUATIONS = 3000
 """Designs that a match may try from each of its starts."""
+
+STOPPING = "Stopping after the designs that are being tried."
 
 SHOWN = ("output", "input", "increment")
 
@@ -72,7 +75,9 @@ class Goals(JSComponent):
 
     ``state`` holds the rows and the number of the message it answers, ``progress`` all
     that moves; ``offer`` what rows may hold; ``typed`` a text for the field of the
-    gain.  ``sent`` goes to the server: what to do ("act").
+    gain.  ``sent`` goes to the server: what to do ("act"), one at a time unless it was
+    told by ``busy`` that the answer takes a while, and which share of it is done.
+    ``stop`` counts how often the search was cancelled.
     """
 
     offer = param.Dict(default={})
@@ -80,7 +85,9 @@ class Goals(JSComponent):
     progress = param.Dict(default={})
     typed = param.Dict(default={})
     figures = param.Integer(default=0)
+    busy = param.Dict(default={})
     sent = param.Dict(default={})
+    stop = param.Integer(default=0)
     leads = param.Dict(default={})
 
     _esm = script("goals.js")
@@ -107,6 +114,15 @@ class Live(NamedTuple):
     values: Mapping[str, float]
 
 
+class Rows(WithForm):
+    """The rows and their buttons: long answers give way as those to the form do."""
+
+    controls: Any
+
+    def __init__(self, choices: TuneChoices, goals: Goals) -> None:
+        self.choices, self.controls = choices, goals
+
+
 class TunePage(WithForm, WithBar, BackgroundPage):
     """One session's page: keeps the last design and picture that worked."""
 
@@ -115,10 +131,9 @@ class TunePage(WithForm, WithBar, BackgroundPage):
         self.choices = TuneChoices()
         self.complaint = _from_address(self.choices)
         self.lock = threading.RLock()
-        self.stop = threading.Event()
         self.stopping = self.matching = False
-        self.work: Future[None] | None = None
-        self.lent: Lent | None = None
+        self.work: Work | None = None
+        self.running: Future[None] | None = None
         self.began = self.lasted = 0.0
         self.past: list[Place] = []
         self.live: Live | None = None
@@ -130,7 +145,7 @@ class TunePage(WithForm, WithBar, BackgroundPage):
         self.lead, self.alert, self.legend, self.weights, self.measures, self.python = (
             _text(name) for name in texts
         )
-        self._open()
+        self._opened(self._open)
         charts = self._charts()
         times = Range1d(*charts[0].span)
         self.figures = {
@@ -150,7 +165,9 @@ class TunePage(WithForm, WithBar, BackgroundPage):
         self.controls = Controls(
             form=self._form(), state=self._state(0), sizing_mode="stretch_width"
         )
+        self.rows = Rows(self.choices, self.goals)
         self.goals.param.watch(self._act, "sent")
+        self.goals.param.watch(self._cancel, "stop")
         self._make_bar()
         self._tell()
         if self.document is not None:
@@ -158,15 +175,10 @@ class TunePage(WithForm, WithBar, BackgroundPage):
             pn.state.onload(get_ready)
 
     def _open(self) -> None:
-        """Begin with the choices of the address, or with the case as it is."""
-        try:
-            self._renew()
-            if not self._runs()[0]:
-                raise ValueError("the loop is unstable with these choices")
-        except ValueError as error:
-            self.complaint = self.complaint or f"{ADDRESS}{error}"
-            self.choices.take_case(self.choices.case)
-            self._renew()
+        """Begin with the choices there are."""
+        self._renew()
+        if not self._runs()[0]:
+            raise ValueError("the loop is unstable with these choices")
 
     # From the form
 
@@ -177,7 +189,11 @@ class TunePage(WithForm, WithBar, BackgroundPage):
             message = sent.pop("message", 0)
             sent.pop("goals", None)  # the rows have a way of their own
             form, seen = self.choices.description(), self._seen
-            self._guard(lambda: self._changed(sent), self.choices.values())
+            try:
+                with self._attended(message):
+                    self._guard(lambda: self._changed(sent), self.choices.values())
+            except Withdrawn:
+                return
             if self.choices.description() != form:
                 self.controls.form = self._form()
             if self._seen != seen:
@@ -195,12 +211,16 @@ class TunePage(WithForm, WithBar, BackgroundPage):
         return (*shown, self.made_for, self.tried_for)
 
     def _changed(self, sent: dict[str, Any]) -> None:
-        """Take over choices, all or none."""
+        """Take over choices, all or none; what is held stays if a newer one comes."""
         before = self.choices.values()
         try:
             self._accept(sent)
             self._renew()
-        except ValueError:
+        except Withdrawn:
+            kept = {key: getattr(self.choices, key) for key in HELD}
+            self.choices.accept({**before, **kept})
+            raise
+        except Exception:
             self.choices.accept(before)
             raise
 
@@ -214,28 +234,55 @@ class TunePage(WithForm, WithBar, BackgroundPage):
         """
         choices = self.choices
         made_for = tuple(getattr(choices, key) for key in choices.of_design)
-        tried_for = choices.conditions
-        if made_for != self.made_for:
-            start, bench = choices.start(), choices.bench()
-            choices.aims(bench)
-            bench.runs(start)
-            self.call_off()
-            self.stop, self.work, self.live = threading.Event(), None, None
-            self.past.clear()
-            self.place = Place(start)
-            self.history, self.tried, self.matched = [], 0, ""
-        elif tried_for != self.tried_for:
-            bench = choices.bench()
-            before = choices.dressed(self.place.before)
-            after = self.place.after and choices.dressed(self.place.after)
-            bench.runs(before)
-            if self.work is not None:
-                self.stop.set()  # what it found so far comes all the same
-            self.place = self.place._replace(before=before, after=after)
-            self.live = None
+        anew = made_for != self.made_for
+        changed = choices.conditions != self.tried_for
+        bench = choices.bench() if anew or changed else self.bench
+        if anew:
+            place = Place(bench.start)
         else:
-            return
-        self.bench, self.made_for, self.tried_for = bench, made_for, tried_for
+            place = self._dressed(self.place) if changed else self.place
+        self._prepare(bench, place)
+        if anew:
+            self.call_off()
+            self.work, self.running = None, None
+            self.past.clear()
+            self.history, self.tried, self.matched = [], 0, ""
+        elif changed and self.work is not None:
+            self.work.stop.set()  # what it found so far comes all the same
+        if anew or changed:
+            self.live = None
+        self.bench, self.place = bench, place
+        self.made_for, self.tried_for = made_for, choices.conditions
+
+    def _dressed(self, place: Place) -> Place:
+        """Put the designs of a place under the conditions that are chosen."""
+        dressed = self.choices.dressed
+        after = place.after and dressed(place.after)
+        return place._replace(before=dressed(place.before), after=after)
+
+    def _prepare(
+        self, bench: Bench, place: Place, aims: Sequence[Aim] | None = None
+    ) -> None:
+        """Find out on a bench all that the page shows of a place.
+
+        Whoever attends hears of it, and may end it.
+
+        Raises
+        ------
+        ValueError
+            If a design cannot be tried, or all would take too long.
+        """
+        choices, hears = self.choices, self.choices.hears or (lambda share: None)
+        if aims is None:
+            aims = choices.aims(bench, lambda share: hears(share / 2))
+        shown = [place.before, place.after]
+        if self.live is not None and bench is self.bench:
+            shown.append(self.live.design)
+        if choices.view == "compare":
+            shown += choices.fitting().values()
+        designs = [design for design in shown if design is not None]
+        goals = {design: choices.library(aims, bench, design) for design in designs}
+        bench.prepare(goals, lambda share: hears((1 + share) / 2))
 
     # From the rows and their buttons
 
@@ -254,30 +301,50 @@ class TunePage(WithForm, WithBar, BackgroundPage):
             "robust": lambda: self._send("robustness"),
             "match": lambda: self._match(str(sent.get("text", ""))),
             "gain": self._type_gain,
+            "stay": self._stay,
         }
-        if act == "cancel":
-            self.stop.set()
-            self.stopping = self.work is not None
-            self.goals.progress = self._progress()
-            return
         if act not in actions:
             return
         with self.lock:
-            self._guard(actions[str(act)], sent)
-            if act in ("gain", "save", "loop", "robust"):
+            try:
+                with self.rows._attended(number):
+                    self._guard(actions[str(act)], sent)
+            except Withdrawn:
+                return
+            if act in ("gain", "loop", "robust"):
                 self.alert.object = _complaint(self.complaint)
+                self.goals.state = {**self.goals.state, "answer": number}
                 return
             self._show(number)
             if act in ("goals", "add", "suggest"):
                 self.controls.state = self._state(0)
 
+    def _cancel(self, event: Any) -> None:
+        """End the search with what it has found, whatever answer is under way."""
+        if self.work is None or self.running is None:
+            return
+        if self.matching:  # half a match is none
+            self.work.call_off()
+        else:
+            self.work.stop.set()
+        self.stopping = True
+        stopping = {"stopping": True, "note": STOPPING}
+        self.goals.progress = {**self.goals.progress, **stopping}
+
+    def _stay(self) -> None:
+        raise ValueError("Cancelled.")
+
     def _edit(self, rows: Sequence[Mapping[str, Any]]) -> None:
         """Take over rows; one whose objective is new begins with what there is now."""
         try:
             texts = [self._row_text(row) for row in rows]
+            new = [row["target"] is None for row in rows]
         except (KeyError, TypeError) as error:
             raise ValueError(f"goals: {error}") from error
-        self._set(aims_of(";".join(texts), self.choices.example.model.n_y))
+        aims = aims_of(";".join(texts), self.choices.example.model.n_y)
+        self._prepare(self.bench, self.place, aims)
+        pairs = zip(aims, new, strict=True)
+        self._set([self._as_now(aim) if fresh else aim for aim, fresh in pairs])
 
     def _row_text(self, row: Mapping[str, Any]) -> str:
         objective = str(row["objective"])
@@ -287,13 +354,8 @@ class TunePage(WithForm, WithBar, BackgroundPage):
         tau = float(row.get("tau") or 0.0) * seconds
         if objective == "distance" and not tau:
             tau = 10.0 * self.choices.example.plant.dt
-        aim = Aim(objective, int(row["output"]), 0.0, float(row["share"]), tau)
-        if row["target"] is None:
-            aim = self._as_now(aim)
-        else:
-            factor = self.choices.factor(objective)
-            aim = replace(aim, target=float(row["target"]) * factor)
-        return aim.text
+        target = float(row["target"] or 0.0) * self.choices.factor(objective)
+        return Aim(objective, int(row["output"]), target, float(row["share"]), tau).text
 
     def _as_now(self, aim: Aim) -> Aim:
         """Set the target to what the design before tuning does."""
@@ -301,33 +363,44 @@ class TunePage(WithForm, WithBar, BackgroundPage):
         return replace(aim, target=float(f"{now:.3g}") if math.isfinite(now) else 1.0)
 
     def _set(self, aims: Sequence[Aim]) -> None:
-        self._values(self.place.before, aims)  # refuses what cannot be tried
-        self.choices.goals = ";".join(aim.text for aim in aims)
+        text = ";".join(aim.text for aim in aims)
+        aims_of(text, self.choices.example.model.n_y)  # refuses what cannot be
+        self.choices.goals = text
 
     def _add(self) -> None:
+        """Add the first objective that no row has and that can be told."""
         aims = self._aims()
         known = {aim.key for aim in aims}
         n_y = self.choices.example.model.n_y
-        for objective, kind in KINDS.items():
-            if objective == "distance" or (objective == "coupling" and n_y == 1):
-                continue
-            for output in range(n_y if kind.each else 1):
-                aim = Aim(objective, output, 0.0)
-                if aim.key in known:
-                    continue
-                if math.isfinite(self._values(self.place.before, [aim])[aim.key]):
-                    self._set([*aims, self._as_now(aim)][:MOST_GOALS])
-                    return
+        others = [
+            Aim(objective, output, 0.0)
+            for objective, kind in KINDS.items()
+            if objective != "distance" and (objective != "coupling" or n_y > 1)
+            for output in range(n_y if kind.each else 1)
+        ]
+        others = [aim for aim in others if aim.key not in known]
+        self._prepare(self.bench, self.place, [*aims, *others])
+        values = self._values(self.place.before, others)
+        for aim in others:
+            if math.isfinite(values[aim.key]):
+                self._set([*aims, self._as_now(aim)][:MOST_GOALS])
+                return
 
     def _suggest(self) -> None:
-        self.choices.goals = ""
+        before, self.choices.goals = self.choices.goals, ""
+        try:
+            self._prepare(self.bench, self.place)
+        except Exception:
+            self.choices.goals = before
+            raise
 
     def _undo(self) -> None:
         if not self.past:
             raise ValueError("there is nothing to undo")
-        place, dressed = self.past.pop(), self.choices.dressed
-        after = place.after and dressed(place.after)
-        self.place = place._replace(before=dressed(place.before), after=after)
+        place = self._dressed(self.past[-1])
+        self._prepare(self.bench, place)
+        self.past.pop()
+        self.place = place
         self.history, self.tried = list(place.history), place.tried
         self.matched, self.lasted = "", 0.0
 
@@ -399,80 +472,109 @@ class TunePage(WithForm, WithBar, BackgroundPage):
 
     def _begin(self) -> None:
         """Start a search off the event loop."""
-        if self.work is not None:
+        if self.running is not None:
             raise ValueError("a search is running: cancel it first")
         self._renew()
         aims = self._aims()
         job = self.choices.job(self.place.before, aims, self.bench)
         keys = [aim.key for aim in aims]
-        bench, stop = self.bench, self._start()
+        bench = self.bench
         self.history, self.tried = [], 0
-        lent = self.lent
-        self.work = WAITING.submit(
-            self._beside, stop, lambda: self._search(stop, job, keys, bench, lent)
+        self._start(
+            lambda work: self._search(work, job, keys, bench),
+            lambda found: self._finished(job["design"], *found),
         )
 
-    def _start(self) -> threading.Event:
-        self.stop = threading.Event()
-        self.lent = Lent(processes())
-        self.live, self.stopping, self.matching = None, False, False
+    def _start(
+        self, find: Callable[[Work], Found], take: Callable[[Found], None]
+    ) -> None:
+        """Find something in a thread; take it over on the event loop."""
+        work, found = Work(), list[Found]()
+        self.work, self.live, self.stopping, self.matching = work, None, False, False
         self.began, self.matched = time.monotonic(), ""
-        return self.stop
+
+        def ended(problem: str) -> None:
+            self._when_free(lambda: self._ended(work, problem, found, take))
+
+        self.running = self._in_thread(work, lambda: found.append(find(work)), ended)
+
+    def _when_free(self, action: Callable[[], None]) -> None:
+        """Do something once no answer is under way, without keeping the event loop."""
+        document = self.document
+        if self.lock.acquire(blocking=document is None):
+            try:
+                action()
+            finally:
+                self.lock.release()
+        elif document is not None and document.session_context is not None:
+            document.add_timeout_callback(lambda: self._when_free(action), LOOK_AGAIN)
+
+    def _ended(
+        self,
+        work: Work,
+        problem: str,
+        found: Sequence[Found],
+        take: Callable[[Found], None],
+    ) -> None:
+        """Take over what was found, or say why nothing was."""
+        if work is not self.work:
+            return
+        if self.matching and not found and not problem:
+            self.matched = "Cancelled."
+        self.running, self.live, self.matching = None, None, False
+        self.lasted = time.monotonic() - self.began
+        self.ended += 1
+        self.complaint = problem
+        for result in found:
+            self._remember()
+            take(result)
+        self._show()
 
     def call_off(self) -> None:
         """Have the work stop at once: what it found is of no use any more."""
-        self.stop.set()
-        if self.lent is not None:
-            self.lent.withdraw()
-
-    def _beside(self, stop: threading.Event, work: Callable[[], None]) -> None:
-        """Do the work of a thread that waits; say on the event loop what went wrong."""
-        try:
-            if not stop.is_set():
-                work()
-        except CancelledError:
-            self._later(lambda: self._failed(stop, ""))
-        except ValueError as error:
-            text = str(error)
-            self._later(lambda: self._failed(stop, text))
-        except Exception:
-            if stop.is_set():  # the processes have ended under it
-                return
-            LOG.exception("tune %s", self.choices.values())
-            self._later(lambda: self._failed(stop, FAULT))
+        if self.work is not None:
+            self.work.call_off()
 
     def _search(
-        self,
-        stop: threading.Event,
-        job: dict[str, Any],
-        keys: Sequence[str],
-        bench: Bench,
-        lent: Lent | None,
-    ) -> None:
+        self, work: Work, job: dict[str, Any], keys: Sequence[str], bench: Bench
+    ) -> tuple[Tuned, Design]:
         """Search in this thread; designs are tried in other processes."""
         told, pause, drawn = 0.0, TOLD_EVERY, math.inf
 
         def heard(step: Step) -> bool:
             nonlocal told, pause, drawn
             now = time.monotonic()
-            if now - told > pause and not stop.is_set():
+            if now - told > pause and not work.stop.is_set():
                 if step.attainment < drawn or self.live is None:
-                    self._picture(stop, job, step, keys, bench)
+                    self._picture(work, job, step, keys, bench)
                     drawn = step.attainment
                 else:
-                    self._later(lambda: self._heard(stop, None, step.evaluation))
+                    self._later(lambda: self._heard(work, None, step.evaluation))
                 told = time.monotonic()
                 pause = max(TOLD_EVERY, 3.0 * (told - now))  # pictures cost time, too
-            return stop.is_set()
+            return work.stop.is_set()
 
-        tuned = tune(**job, callback=heard, executor=lent)
+        tuned = tune(**job, callback=heard, executor=work.lent)
         bench.know(tuned.design, dict(zip(keys, map(float, tuned.values), strict=True)))
-        bench.runs(tuned.design)
-        self._later(lambda: self._finished(stop, tuned, job["design"], bench))
+        return tuned, self._tried(work, tuned.design, bench)
+
+    def _tried(self, work: Work, found: Design, bench: Bench) -> Design:
+        """Try a design under the conditions that are chosen by now; return it so."""
+        design, known = found, None
+        while known is not self.bench:
+            with self.lock:
+                if work is not self.work:
+                    raise Withdrawn
+                known = self.bench
+                if known is not bench:  # limits have changed since
+                    design = self.choices.dressed(found)
+                goals = self.choices.library(self._aims(), known, design)
+            known.prepare({design: goals})
+        return design
 
     def _picture(
         self,
-        stop: threading.Event,
+        work: Work,
         job: dict[str, Any],
         step: Step,
         keys: Sequence[str],
@@ -487,62 +589,43 @@ class TunePage(WithForm, WithBar, BackgroundPage):
         except (ValueError, np.linalg.LinAlgError):
             return  # the picture of the one before stays
         values = dict(zip(keys, map(float, step.values), strict=True))
+        bench.know(design, values)
         live = Live(design, step, values)
-        self._later(lambda: self._heard(stop, live, step.evaluation))
+        self._later(lambda: self._heard(work, live, step.evaluation))
 
-    def _heard(self, stop: threading.Event, live: Live | None, tried: int) -> None:
-        """Show how far a search is."""
-        if stop is not self.stop or self.work is None:
+    def _heard(self, work: Work, live: Live | None, tried: int) -> None:
+        """Show how far a search is, unless an answer is under way."""
+        if not self.lock.acquire(blocking=False):
             return
-        self.tried = tried
-        if live is not None:
-            self.live = live
-            self.history.append((live.step.evaluation, float(live.step.attainment)))
-            self.bench.forget(self._in_use())
-            self._paint()
-        self.goals.progress = self._progress()
+        try:
+            if work is not self.work or self.running is None or work.stop.is_set():
+                return
+            self.tried = tried
+            if live is not None:
+                self.live = live
+                step = live.step
+                self.history.append((step.evaluation, float(step.attainment)))
+                self.bench.forget(self._in_use())
+                self._paint()
+            self.goals.progress = self._progress()
+        finally:
+            self.lock.release()
 
-    def _finished(
-        self, stop: threading.Event, tuned: Tuned, start: Design, bench: Bench
-    ) -> None:
+    def _finished(self, start: Design, tuned: Tuned, design: Design) -> None:
         """Take over what a search has found."""
-        if stop is not self.stop:
-            return
-        with self.lock:
-            self._remember()
-            self._end()
-            self.history = [(s.evaluation, float(s.attainment)) for s in tuned.history]
-            self.tried = tuned.evaluations
-            design: Design | None = tuned.design
-            if bench is not self.bench:  # limits have changed since
-                design = self.choices.dressed(tuned.design)
-            if tuned.design is start:
-                design = None
-            stopped = tuned.stopped
-            if stop.is_set():
-                stopped = "Cancelled: the best so far is kept."
-            self.place = Place(
-                self.place.before,
-                design,
-                tuple(self.history),
-                self.tried,
-                stopped if design else f"{stopped} No better design was found.",
-            )
-            self.complaint = ""
-            self._show()
-
-    def _end(self) -> None:
-        self.work, self.live, self.matching = None, None, False
-        self.lasted = time.monotonic() - self.began
-        self.ended += 1
-
-    def _failed(self, stop: threading.Event, text: str) -> None:
-        if stop is not self.stop:
-            return
-        with self.lock:
-            self._end()
-            self.complaint = text
-            self._show()
+        self.history = [(s.evaluation, float(s.attainment)) for s in tuned.history]
+        self.tried = tuned.evaluations
+        better = None if tuned.design is start else design
+        stopped = tuned.stopped
+        if self.work is not None and self.work.stop.is_set():
+            stopped = "Cancelled: the best so far is kept."
+        self.place = Place(
+            self.place.before,
+            better,
+            tuple(self.history),
+            self.tried,
+            stopped if better else f"{stopped} No better design was found.",
+        )
 
     # Matching a gain
 
@@ -566,37 +649,31 @@ class TunePage(WithForm, WithBar, BackgroundPage):
 
     def _match(self, text: str) -> None:
         """Look for weights that give a gain."""
-        if self.work is not None:
+        if self.running is not None:
             raise ValueError("a search is running: cancel it first")
         self._renew()
         K, design = gain_of(text, *self._gain_shape), self.place.before
-        stop = self._start()
-        lent, self.matching = self.lent, True
+        bench = self.bench
 
-        def work() -> None:
+        def find(work: Work) -> tuple[Match, Design]:
             found = match(
-                K, design, starts=2, evaluations=MATCH_EVALUATIONS, executor=lent
+                K,
+                design,
+                starts=2,
+                evaluations=MATCH_EVALUATIONS,
+                executor=work.lent,
             )
-            self._later(lambda: self._has_matched(stop, found, K))
+            return found, self._tried(work, found.design, bench)
 
-        self.work = WAITING.submit(self._beside, stop, work)
+        self._start(find, lambda found: self._has_matched(K, *found))
+        self.matching = True
 
-    def _has_matched(self, stop: threading.Event, found: Match, K: Array) -> None:
-        if stop is not self.stop:
-            return
-        with self.lock:
-            self._end()
-            if stop.is_set():
-                self.matched = "Cancelled."
-            else:
-                self._remember()
-                self.history, self.tried = [], 0
-                design = self.choices.dressed(found.design)
-                note = "Matched to the gain."
-                self.place = Place(self.place.before, design, note=note, gain=K)
-                self.matched = _matched(found)
-                self.complaint = ""
-            self._show()
+    def _has_matched(self, K: Array, found: Match, design: Design) -> None:
+        """Take over weights that give a gain, or nearly."""
+        self.history, self.tried = [], 0
+        note = "Matched to the gain."
+        self.place = Place(self.place.before, design, note=note, gain=K)
+        self.matched = _matched(found)
 
     # To the page
 
@@ -776,7 +853,7 @@ class TunePage(WithForm, WithBar, BackgroundPage):
         return rows
 
     def _progress(self) -> dict[str, Any]:
-        choices, running = self.choices, self.work is not None
+        choices, running = self.choices, self.running is not None
         aims = self._aims()
         values: dict[str, float | None] = {}
         if self.live is not None:
@@ -813,7 +890,7 @@ class TunePage(WithForm, WithBar, BackgroundPage):
 
     def _note(self, factor: float, running: bool) -> str:
         if self.stopping and running:
-            return "Stopping after the designs that are being tried."
+            return STOPPING
         if running:
             return "Looking for weights that match." if self.matching else "Searching."
         note = self.place.note
