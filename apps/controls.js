@@ -33,6 +33,19 @@ export function render({ model, el }) {
   const idle = () => waiting === null && !changed
   window.nmssForm = { latency, idle }  // for tests and measurements
 
+  // Whoever hears nothing for so long, no answer and not how far it is, asks once more
+  const PATIENCE = 10000
+  let silence = 0
+  const listen = () => {
+    clearTimeout(silence)
+    silence = setTimeout(() => {
+      if (waiting === null) return
+      waiting = ++sent
+      model.sent = { ...model.sent, message: waiting }
+      listen()
+    }, PATIENCE)
+  }
+
   const send = () => {
     if (waiting !== null && (alone || model.busy.message !== waiting)) { changed = true; return }
     changed = false
@@ -47,6 +60,7 @@ export function render({ model, el }) {
     waiting = ++sent
     const { A, B, ...own } = values  // what is held is the bar's to change
     model.sent = { ...own, message: waiting }
+    listen()
     delete values.reset
     delete values.whole
   }
@@ -297,6 +311,7 @@ export function render({ model, el }) {
   }
   window.addEventListener("nmss-group", group)
   model.on("remove", () => {
+    clearTimeout(silence)
     window.removeEventListener("nmss-choose", elsewhere)
     window.removeEventListener("nmss-group", group)
     for (const [name, heard] of listened) window.removeEventListener(name, heard)
@@ -312,6 +327,7 @@ export function render({ model, el }) {
     const answer = model.state.message
     if (waiting !== null && answer < waiting) return
     waiting = null
+    clearTimeout(silence)
     long.remove()
     clearTimeout(busy)
     delete document.documentElement.dataset.busy
@@ -345,9 +361,11 @@ export function render({ model, el }) {
     changed = false
     waiting = ++sent
     model.sent = { cancel: true, message: waiting }
+    listen()
   })
   model.on("busy", () => {
     if (model.busy.message !== waiting) return
+    listen()
     bar.value = model.busy.share
     if (!long.isConnected) el.prepend(long)
     if (changed) send()

@@ -508,6 +508,34 @@ def test_latest_value_wins(visit: Open) -> None:
     assert set(json.loads(shown)) == {59}
 
 
+LOSE_ONE = """() => {
+  const send = WebSocket.prototype.send
+  let frames = []  // header, metadata and content of a message
+  WebSocket.prototype.send = function (data) {
+    frames.push(data)
+    if (frames.length < 3) return
+    const lost = frames[2].includes?.('"message"') && !window.lost
+    if (lost) window.lost = true
+    else for (const frame of frames) send.call(this, frame)
+    frames = []
+  }
+}"""
+
+
+def test_a_message_that_is_lost_is_sent_again(visit: Open) -> None:
+    """Whoever hears nothing for ten seconds asks once more, and is answered."""
+    page = visit(f"receding_horizon?{QUICK}")
+    settled(page)
+    page.evaluate(LOSE_ONE)
+    slide(page, "Np", "max")
+    assert page.evaluate("lost")
+    assert page.evaluate("nmssForm.latency.at(-1)") > 9_000
+    shown = page.evaluate("JSON.stringify(nmssPlayer.steps)")
+    assert set(json.loads(shown)) == {
+        float(page.locator("input[name=Np]").input_value())
+    }
+
+
 @pytest.mark.parametrize("path", PAGES)
 @pytest.mark.parametrize("width", [390, 1024])
 def test_fits_the_screen(visit: Open, path: str, width: int) -> None:

@@ -567,17 +567,17 @@ def test_spans_by_mouse_and_by_keyboard(visit: Open) -> None:
     """Dragging a box and typing a time do the same; the link restores it."""
     page = visit()
     field = page.locator("input[name=est_to]")
-    before = float(field.input_value())
+    before = field.input_value()
     frame = page.locator(".chart.output").bounding_box()
-    x = frame["x"] + page.evaluate(TO_PIXELS, before)
+    x = frame["x"] + page.evaluate(TO_PIXELS, float(before))
     y = frame["y"] + 0.66 * frame["height"]
     page.mouse.move(x, y)
     page.mouse.down()
     page.mouse.move(x - 120, y, steps=6)
     page.mouse.up()
-    expect(field).not_to_have_value(str(before))
+    expect(field).not_to_have_value(before)
     page.wait_for_function("nmssForm.idle()")
-    assert float(field.input_value()) < before
+    assert float(field.input_value()) < float(before)
     field.fill("1200")
     field.press("Tab")
     page.wait_for_function(
