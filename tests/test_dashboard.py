@@ -6,17 +6,21 @@ import contextlib
 import io
 import json
 from collections.abc import Iterator
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import param
 import pytest
+from bokeh.document import Document
 from conftest import REPLAY, Open, Server, picture, settled, slide
+from panel.io.state import set_curdoc
 from playwright.sync_api import expect
 
 from apps.pages import governor, receding_horizon
 from apps.pages.live import LivePage, Subject
 from apps.session import HELD, Choices, GovernorChoices, LoopChoices, plain
+from apps.work import Withdrawn
 from nmss_lab.measures import table
 from nmss_lab.plots import Chart, busiest_sample, draw, loop_charts, pack, sentences
 
@@ -506,6 +510,19 @@ def test_latest_value_wins(visit: Open) -> None:
     assert page.evaluate("nmssForm.latency.length") < 45
     shown = page.evaluate("JSON.stringify(nmssPlayer.steps)")
     assert set(json.loads(shown)) == {59}
+
+
+def test_answer_ends_when_its_page_is_closed() -> None:
+    """Nobody waits for it, and others wait for its thread."""
+    page = LivePage(receding_horizon.SUBJECT)
+    context = SimpleNamespace(destroyed=False)
+    document = Document()
+    document._session_context = lambda: context
+    with set_curdoc(document), page._attended(1):
+        page.choices.hears(0.1)
+        context.destroyed = True
+        with pytest.raises(Withdrawn):
+            page.choices.hears(0.2)
 
 
 LOSE_ONE = """() => {

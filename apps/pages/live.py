@@ -124,12 +124,16 @@ class WithForm:
 
     @contextlib.contextmanager
     def _attended(self, message: int) -> Iterator[None]:
-        """Tell the form how far a long answer is; end it once there is a newer one."""
+        """Tell the form how far a long answer is.
+
+        It ends once there is a newer one, or nobody left who waits for it.
+        """
         asked, told = self.controls.sent, time.monotonic() + PATIENT - TOLD_EVERY
+        session = pn.state.curdoc and pn.state.curdoc.session_context
 
         def hears(share: float) -> None:
             nonlocal told
-            if self.controls.sent is not asked:
+            if self.controls.sent is not asked or (session and session.destroyed):
                 raise Withdrawn
             if time.monotonic() - told > TOLD_EVERY:
                 told = time.monotonic()
