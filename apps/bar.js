@@ -45,14 +45,17 @@ const asPNG = async () => {
 }
 
 export function render({ model, el }) {
-  let busy = 0
+  let busy = 0, long = 0
   const send = (what) => {
     clearTimeout(busy)
+    if (what.act === "open") long = setTimeout(() => { stop.hidden = false }, 500)
     busy = setTimeout(() => { document.documentElement.dataset.busy = "" }, 300)
     model.sent = { ...what, number: (model.sent.number ?? 0) + 1 }
   }
   model.on("answered", () => {
     clearTimeout(busy)
+    clearTimeout(long)
+    stop.hidden = true
     delete document.documentElement.dataset.busy
   })
   const button = (text, action, attributes = {}) => {
@@ -125,8 +128,11 @@ export function render({ model, el }) {
   }
   const note = element("span", { class: "said", role: "status" })
 
+  const stop = button("Stop opening", () => { model.stop += 1 })
+  stop.hidden = true
+
   const bar = element("div", { class: "designs" },
-    loaded, undo, redo, slots.A[0], slots.B[0], compare, file, note)
+    loaded, undo, redo, slots.A[0], slots.B[0], compare, stop, file, note)
   el.append(bar)
 
   const show = () => {

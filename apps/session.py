@@ -92,8 +92,14 @@ def keep_model(estimate: Estimate) -> str:
     return keep_case("model", dumps(estimate), example, origin)
 
 
-def open_design(text: str) -> str:
+def open_design(text: str, hears: Callable[[], None] = lambda: None) -> str:
     """Keep what a design file holds; return the address of the page that shows it.
+
+    Parameters
+    ----------
+    text : str
+    hears : callable
+        Called while its run is tried; may end that by raising.
 
     Raises
     ------
@@ -106,7 +112,7 @@ def open_design(text: str) -> str:
         page, name = "receding_horizon", keep_model(content)
     else:
         page, name = _keep_study(content)
-    _try_out(MAKERS[page](case=name))
+    _try_out(MAKERS[page](case=name), hears)
     return f"{page}?case={name}"
 
 
@@ -140,7 +146,7 @@ def _keep_study(content: Any) -> tuple[str, str]:
     return "governor" if design.structure in PAIR else "receding_horizon", name
 
 
-def _try_out(choices: Choices) -> None:
+def _try_out(choices: Choices, heard: Callable[[], None]) -> None:
     """Run what a page would open with, for as long as it may take there.
 
     Raises
@@ -151,6 +157,7 @@ def _try_out(choices: Choices) -> None:
     until = time.monotonic() + TRIAL
 
     def hears(share: float) -> None:
+        heard()
         if time.monotonic() > until:
             raise ValueError(
                 f"its run takes more than {TRIAL:g} s, {share:.0%} of all were done: "

@@ -236,6 +236,11 @@ def test_bad_designs(visit: Open) -> None:
         expect(alert).to_contain_text(f"{name}: ")
         expect(alert).to_contain_text(words)
         unhurt(page)
+    give("long.json", dumps(LONG).encode())
+    stop = page.get_by_role("button", name="Stop opening")
+    stop.click()
+    expect(alert).to_contain_text("long.json: given up")
+    expect(stop).to_be_hidden()
     page.evaluate(UNREAD)
     give("large.json", b" " * (bar.LARGEST + 1))
     expect(alert).to_contain_text("up to 2 MB")  # though nothing was read

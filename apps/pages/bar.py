@@ -14,6 +14,7 @@ from panel.custom import JSComponent
 
 from apps.player import STYLE, hand_over, script
 from apps.session import HELD, case_title, held, open_design, plain
+from apps.work import Withdrawn
 from nmss_lab.files import Study, dumps
 from nmss_lab.report import report
 from nmss_lab.simulate import Run
@@ -30,7 +31,8 @@ class Bar(JSComponent):
     """What is loaded and held, and a menu of files.
 
     ``told`` comes from the server, ``sent`` goes to it: what to do ("act") with which
-    design.  ``saved`` is a file for the browser to keep, ``leads`` an address to open.
+    design.  ``stop`` counts how often the opening of a file was given up.  ``saved`` is
+    a file for the browser to keep, ``leads`` an address to open.
     """
 
     told = param.Dict(default={})
@@ -38,6 +40,7 @@ class Bar(JSComponent):
     saved = param.Dict(default={})
     leads = param.Dict(default={})
     answered = param.Integer(default=0)
+    stop = param.Integer(default=0)
     most = param.Integer(default=LARGEST)
 
     _esm = script("bar.js")
@@ -195,9 +198,16 @@ class WithBar:
                 f"{name} has {size / 1e6:.3g} MB, a design file has up to "
                 f"{LARGEST / 1e6:g} MB"
             )
-        text = str(sent.get("text", ""))
+        text, stop = str(sent.get("text", "")), self.bar.stop
+
+        def goes_on() -> None:
+            if self.bar.stop != stop:
+                raise Withdrawn
+
         try:
-            leads = open_design(text)
+            leads = open_design(text, goes_on)
+        except Withdrawn:
+            raise ValueError(f"{name}: given up") from None
         except ValueError as error:
             raise ValueError(f"{name}: {error}") from error
         hand_over(self.bar, "leads", to=leads)
