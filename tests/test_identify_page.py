@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import json
+import re
 import threading
 import time
 from collections.abc import Iterator
@@ -576,6 +577,8 @@ def test_spans_by_mouse_and_by_keyboard(visit: Open) -> None:
     page.mouse.move(x - 120, y, steps=6)
     page.mouse.up()
     expect(field).not_to_have_value(before)
+    dragged = page.evaluate("Bokeh.documents[0].get_model_by_name('span-est').right")
+    expect(field).to_have_value(re.compile(rf"^{int(dragged)}\b"))  # the last step
     page.wait_for_function("nmssForm.idle()")
     assert float(field.input_value()) < float(before)
     field.fill("1200")
