@@ -88,7 +88,7 @@ class Planned(Move):
         """Fill in what is not there yet; only then is it asked here."""
         law = cast(Law, self.law)
         if name == "cost":
-            self.cost = law.region.program.cost(self.decision, self.known)
+            self.cost = law.program.cost(self.decision, self.known)
         elif name == "iterations":
             others = law.region.held != self.last.region.held
             self.iterations = np.array(np.count_nonzero(others))

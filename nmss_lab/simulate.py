@@ -289,9 +289,8 @@ def closed_loops(
     ValueError
         If the plants' sizes differ or do not fit.
     """
-    together = _Stacked(plants)
-    found = together if len(plants) > 1 else _Only(together.plants[0])
-    return _collect(found, controller, scenario, keep_moves)
+    together = _Only(plants[0]) if len(plants) == 1 else _Stacked(plants)
+    return _collect(together, controller, scenario, keep_moves)
 
 
 def loops_of(
