@@ -328,7 +328,7 @@ export function render({ model, el }) {
     if (waiting !== null && answer < waiting) return
     waiting = null
     clearTimeout(silence)
-    long.remove()
+    long.end()
     clearTimeout(busy)
     delete document.documentElement.dataset.busy
     const done = painted
@@ -352,11 +352,7 @@ export function render({ model, el }) {
     }
   }
 
-  // An answer that takes a while
-  const bar = element("progress", { max: 1, value: 0, "aria-label": "Progress of the answer" })
-  const cancel = element("button", { type: "button", class: "wide" }, "Cancel")
-  const long = element("div", { class: "long", role: "group", "aria-label": "Working" }, bar, cancel)
-  cancel.addEventListener("click", () => {
+  const long = longAnswer(el, () => {
     alone = true
     changed = false
     waiting = ++sent
@@ -366,8 +362,7 @@ export function render({ model, el }) {
   model.on("busy", () => {
     if (model.busy.message !== waiting) return
     listen()
-    bar.value = model.busy.share
-    if (!long.isConnected) el.prepend(long)
+    long.show(model.busy.share)
     if (changed) send()
   })
 

@@ -131,3 +131,18 @@ const followTheme = (model, count, ready) => {
   model.on("remove", () => window.removeEventListener("nmss-theme", colour))
   colour()
 }
+
+// An answer that takes a while: how far it is, on top of a part, and a way to give it up
+const longAnswer = (el, cancel) => {
+  const bar = element("progress", { max: 1, value: 0, "aria-label": "Progress of the answer" })
+  const button = element("button", { type: "button", class: "wide" }, "Cancel")
+  const box = element("div", { class: "long", role: "group", "aria-label": "Working" }, bar, button)
+  button.addEventListener("click", cancel)
+  return {
+    show: (share) => {
+      bar.value = share
+      if (!box.isConnected) el.prepend(box)
+    },
+    end: () => box.remove(),
+  }
+}

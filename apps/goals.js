@@ -38,19 +38,14 @@ export function render({ model, el }) {
     return made
   }
 
-  // An answer that takes a while
-  const share = element("progress", { max: 1, value: 0, "aria-label": "Progress of the answer" })
-  const stay = element("button", { type: "button", class: "wide" }, "Cancel")
-  const long = element("div", { class: "long", role: "group", "aria-label": "Working" }, share, stay)
-  stay.addEventListener("click", () => {
+  const long = longAnswer(el, () => {
     changed = false
     pressed = null
     tell({ act: "stay" })
   })
   model.on("busy", () => {
     if (model.busy.message !== waiting) return
-    share.value = model.busy.share
-    if (!long.isConnected) el.prepend(long)
+    long.show(model.busy.share)
     if (changed) send()
   })
 
@@ -212,7 +207,7 @@ export function render({ model, el }) {
   const take = () => {
     if (waiting !== null && model.state.answer < waiting) return
     waiting = null
-    long.remove()
+    long.end()
     if (changed) { send(); return }
     if (pressed !== null) {
       const message = pressed
