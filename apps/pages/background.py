@@ -11,7 +11,7 @@ from typing import Any
 import panel as pn
 
 from apps.pages.live import FAULT, KEPT
-from apps.work import WAITING, Lent, Withdrawn
+from apps.work import WAITING, Lent, Withdrawn, ends_with_the_server
 
 LOG = logging.getLogger(__name__)
 
@@ -42,9 +42,16 @@ class Work:
 class BackgroundPage:
     """One session's page: what threads find out is said on its event loop."""
 
+    call_off: Callable[[], None]
+
     def __init__(self) -> None:
         self.complaint = ""
         self.document, self.served = pn.state.curdoc, False
+
+    def _ends_with_its_page(self) -> None:
+        """Have the work called off when the page is closed, or the server stops."""
+        ends_with_the_server(self, self.document)
+        pn.state.on_session_destroyed(lambda _: self.call_off())
 
     def _later(self, action: Callable[[], None]) -> None:
         """Do something on the event loop of this session, if it still is there."""

@@ -41,7 +41,6 @@ from apps.pages.live import (
 )
 from apps.player import STYLE, Controls, hand_over, script
 from apps.session import HELD, case_title, held, held_as, keep_model
-from apps.work import ends_with_the_server
 from nmss_lab.files import Study, dumps
 from nmss_lab.identify import Candidate, Estimate
 from nmss_lab.plots import Chart, EstimateFigure, estimate_charts, record_charts
@@ -163,8 +162,7 @@ class IdentifyPage(WithRecord, WithBar, BackgroundPage):
         self._weigh()
         self._choose([])
         if self.document is not None:
-            ends_with_the_server(self, self.document)
-            pn.state.on_session_destroyed(lambda _: self.call_off())
+            self._ends_with_its_page()
             pn.state.onload(self._begin)
 
     def call_off(self) -> None:

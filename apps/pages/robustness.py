@@ -40,7 +40,7 @@ from apps.robustness import (
     centre,
 )
 from apps.session import plain
-from apps.work import ends_with_the_server, get_ready
+from apps.work import get_ready
 from nmss_lab.analysis import linear_loop
 from nmss_lab.models import Array
 from nmss_lab.montecarlo import MonteCarlo, join, monte_carlo_parts
@@ -174,8 +174,7 @@ class RobustnessPage(WithForm, WithBar, BackgroundPage):
         self._tell()
         if self.document is not None:
             get_ready()
-            ends_with_the_server(self, self.document)
-            pn.state.on_session_destroyed(lambda _: self.call_off())
+            self._ends_with_its_page()
             pn.state.onload(self._open)
 
     def call_off(self) -> None:

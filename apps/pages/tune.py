@@ -36,7 +36,7 @@ from apps.player import STYLE, Controls, hand_over, script
 from apps.session import HELD, held, held_as, plain
 from apps.tuning import LOOK, OTHERWISE, TuneChoices
 from apps.weight_tables import weight_table
-from apps.work import Withdrawn, ends_with_the_server, get_ready
+from apps.work import Withdrawn, get_ready
 from nmss_lab.design import Design
 from nmss_lab.files import Study
 from nmss_lab.matching import Match, match
@@ -171,7 +171,7 @@ class TunePage(WithForm, WithBar, BackgroundPage):
         self._make_bar()
         self._tell()
         if self.document is not None:
-            ends_with_the_server(self, self.document)
+            self._ends_with_its_page()
             pn.state.onload(get_ready)
 
     def _open(self) -> None:
@@ -980,7 +980,4 @@ def _matched(found: Match) -> str:
 
 def page() -> pn.Template:
     """Build the page for a new session."""
-    made = TunePage()
-    if pn.state.curdoc is not None:
-        pn.state.on_session_destroyed(lambda _: made.call_off())
-    return made.template()
+    return TunePage().template()

@@ -27,7 +27,7 @@ from apps.pages.live import (
 )
 from apps.player import STYLE, Controls, hand_over, script
 from apps.session import held_as, plain
-from apps.work import ends_with_the_server, get_ready
+from apps.work import get_ready
 from apps.workbench import (
     STEPS,
     Bench,
@@ -131,8 +131,7 @@ class WorkbenchPage(WithRecord, WithForm, WithBar, BackgroundPage):
         self._tell()
         if self.document is not None:
             get_ready()
-            ends_with_the_server(self, self.document)
-            pn.state.on_session_destroyed(lambda _: self.call_off())
+            self._ends_with_its_page()
             pn.state.onload(lambda: self._later(lambda: self._begin("model")))
 
     def call_off(self) -> None:
